@@ -40,6 +40,7 @@ _LEVELS = 12  # of uncertainty
 _FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
 _MOST_NAMES = 24  # of views in space
 _SIZE = 0.12  # of a drawn camera, relative to the scene
+_LINES = 4  # of names below each other
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 _HERE = Pose(np.eye(3), np.zeros(3))
 _LONGEST = 0.12  # of a target's plane, for the longest arrow
@@ -157,7 +158,7 @@ def draw_views(axes: Axes, subject: Subject) -> None:
         edges = np.arange(len(errors) + 1) - 0.5
         axes.stairs(np.nan_to_num(errors), edges, fill=True, color=INK)
     axes.axhline(evaluation.rmse_px, color=ACCENT, linewidth=1.2)
-    style(axes, f"Error of each view; the line is that of all points, {evaluation.rmse_px:.3g} px")
+    style(axes, f"Error of each view; line: all points, {evaluation.rmse_px:.3g} px")
     axes.set(ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
     if len(errors) <= _MOST_BARS:
         names = [plain(name[-20:]) for name in evaluation.views]
@@ -285,7 +286,8 @@ def draw_poses(
         extent.append(corners)
         centre, *ends = _turned(corners)
         label = names[number] if names else "camera" if not others else ""
-        space.text(*centre, plain(label), fontsize=9, color=INK, ha="right", va="top")
+        below = "\n" * (number % _LINES) if len(others) > 1 else ""  # names of cameras that stand close
+        space.text(*centre, f"{below}{plain(label)}", fontsize=9, color=INK, ha="right", va="top")
         for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
             space.plot(*np.array([centre, end, after]).T, color=(INK, ACCENT)[number % 2], linewidth=1.2)
     everything = _turned(np.vstack(extent))
@@ -298,7 +300,7 @@ def draw_poses(
     space.yaxis.labelpad = 6
     space.invert_zaxis()
     space.view_init(elev=22, azim=-60)
-    scale = axes.inset_axes((1.2, 0.15, 0.04, 0.7))
+    scale = axes.inset_axes((1.3, 0.15, 0.04, 0.7))
     axes.figure.colorbar(colour, cax=scale, label="rms [px]")
 
 

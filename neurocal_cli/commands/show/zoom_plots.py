@@ -137,6 +137,6 @@ def _draw_baselines(axes: Axes, evaluation: LensEvaluation) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
-    style(axes, "The same points, baseline models")
+    style(axes, "Baseline models, rms [px]")
     axes.set_xlabel("rms [px]")
     axes.tick_params(axis="y", labelsize=7)
