@@ -108,6 +108,14 @@ def _clipped(points: Correspondences) -> Iterator[Finding]:
 
 def _outside(points: Correspondences) -> Iterator[Finding]:
     if points.image_size is None:
+        for name, values in zip("uv", points.pixels.T, strict=True):
+            if values.max() < 0:
+                yield (
+                    1,
+                    f"{name} of all points is negative, so its sign is wrong or it points the other way: a "
+                    "flat target is then seen from behind",
+                    f"measure {name} from the first pixel of the image",
+                )
         return
     size = np.array(points.image_size, dtype=float)
     count = int(_beyond(points.pixels, size).sum())

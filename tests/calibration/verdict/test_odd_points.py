@@ -53,6 +53,17 @@ def test_odd_pixels_are_named(pixels: np.ndarray, said: str) -> None:
     assert said in next(iter(odd_pixels(points)))[1]
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_an_axis_that_points_the_other_way_is_named(axis: int) -> None:
+    pixels = POINTS.pixels * [-1 if k == axis else 1 for k in range(2)]
+    verdict = calibrate(replace(POINTS, pixels=pixels, image_size=None)).verdict
+    assert verdict is not None
+    assert verdict.word == "usable"
+    assert verdict.reasons[0].startswith(f"{'uv'[axis]} of all points is negative")
+    middle = replace(POINTS, pixels=POINTS.pixels - [320, 240], image_size=None)
+    assert list(odd_pixels(middle)) == []
+
+
 def test_the_points_of_good_images_are_not_odd() -> None:
     for seed in range(20):
         points = flat(seed)
