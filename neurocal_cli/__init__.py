@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.many_views import triangulate_many
     from neurocal_cli.calibration.rig.rectification import rectify
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.rig_drift import RigDrift, find_rig_drift
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import triangulate
@@ -87,6 +88,8 @@ _HOMES = {
     "evaluate_stereo": "calibration.rig.evaluation",
     "find_board": "detection.board_kind",
     "find_drift": "calibration.drift",
+    "find_rig_drift": "calibration.rig.rig_drift",
+    "RigDrift": "calibration.rig.rig_drift",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
     "fit_stereo": "calibration.rig.calibrate_stereo",
@@ -125,6 +128,7 @@ __all__ = [
     "NeurocalError",
     "Pose",
     "Rig",
+    "RigDrift",
     "StereoRig",
     "Target",
     "Verdict",
@@ -143,6 +147,7 @@ __all__ = [
     "evaluate_stereo_rig",
     "find_board",
     "find_drift",
+    "find_rig_drift",
     "fit_lens",
     "fit_lens_cameras",
     "fit_stereo",

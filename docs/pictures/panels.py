@@ -53,7 +53,7 @@ def main() -> None:
         "bad-board.png": draw_camera(Subject.of(flat), panel="residuals"),
         "bad-lens.png": draw_camera(Subject.of(simple), panel="residuals"),
         "bent-board.png": draw_target(found.target, found.unit),
-        "two-cameras-differ.png": draw_drift(find_drift(found, flat), found.image_size),
+        "two-cameras-differ.png": draw_drift({"": (find_drift(found, flat), found.image_size)}),
     }
     for name, content in pictures.items():
         (HERE / name).write_bytes(content)

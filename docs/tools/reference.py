@@ -25,7 +25,7 @@ TOPICS = {
     "Calibrating": ["calibrate", "Calibration", "Verdict", "Target", "Correspondences", "Camera",
                     "Intrinsics", "Distortion", "Pose"],
     "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_stereo_rig", "evaluate_rig", "evaluate_lens",
-                "find_drift", "Drift"],
+                "find_drift", "Drift", "find_rig_drift", "RigDrift"],
     "Showing": ["report", "plot", "advise"],
     "Points from images": ["detect_points", "find_board", "Detection", "Board", "read_board", "read_image"],
     "Removing distortion": ["undistort_points", "undistort_image"],

@@ -44,7 +44,7 @@ def _compared(pair: Pair) -> dict[str, Any]:
 def _in_rigs(pair: Pair) -> dict[str, Any]:
     """What changed in a camera of a rig, and in its pose relative to the first camera."""
     from neurocal_cli.calibration.drift import find_drift
-    from neurocal_cli.calibration.rig.pose_drift import find_pose_drift
+    from neurocal_cli.calibration.rig.rig_drift import find_pose_drift
     from neurocal_cli.files.rig_yaml import read_rig
 
     old, new, name = read_rig(pair.old), read_rig(pair.new), pair.camera

@@ -1,4 +1,4 @@
-"""``neurocal drift``: whether a camera has changed since an earlier calibration."""
+"""``neurocal drift``: whether a camera or a rig has changed since an earlier calibration."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import plot_option, write_plot
 from neurocal_cli.commands.streams import answer, note
-from neurocal_cli.errors import FormatError
+from neurocal_cli.errors import FormatError, InputError
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.camera import Camera
 
 _DIFFERENT = 4  # exit status
@@ -22,20 +23,24 @@ _DIFFERENT = 4  # exit status
 @options.argument(
     "old",
     "OLD.yaml",
-    "The earlier calibration of the camera. A ROS or OpenCV file is taken as exact; - is standard input.",
+    "The earlier calibration of the camera or rig. A ROS or OpenCV file is taken as exact; - is standard "
+    "input.",
 )
-@options.argument("new", "NEW.yaml", "The later calibration of the same camera.")
+@options.argument("new", "NEW.yaml", "The later calibration of the same camera or rig.")
 @plot_option("the differences over the image, in pixels and in standard deviations,")
 @options.json
 def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
-    """Tell whether a camera has changed since an earlier calibration.
+    """Tell whether a camera or a rig has changed since an earlier calibration.
 
     The new camera projects the rays of the old camera's pixels. A rotation between the two is fitted first,
     because it belongs to the poses. What is left is the difference in pixels, and its standard deviation
     follows from the covariances of both calibrations. The distortion models of the two may differ.
 
-    Calibrations of an unchanged camera are called different in at most one of 1000 cases. The answer is also
-    the exit status: 0 if the camera is the same within the standard deviations, 4 if it is different.
+    Of two rigs, each camera is compared in this way, and its pose relative to the first camera with the
+    standard deviations of both.
+
+    Calibrations of an unchanged camera or rig are called different in at most one of 1000 cases. The answer
+    is also the exit status: 0 if it is the same within the standard deviations, 4 if it is different.
 
     To compare a calibration with new points instead, see `neurocal evaluate camera`.
 
@@ -46,9 +51,12 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
       neurocal calibrate sample_data/stereo_left.csv -o new.yaml
       neurocal drift old.yaml new.yaml --plot drift.png
       neurocal drift old.yaml new.yaml --json
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv -o rig.yaml
+      neurocal drift rig.yaml rig.yaml
     """  # noqa: D301 - as in the group
     preparation.check((old, new), plots=(plot,))
     from neurocal_cli.calibration.drift import find_drift
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.camera import camera_of
     from neurocal_cli.commands.show.drift_report import (
         details_json,
@@ -60,11 +68,14 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
     from neurocal_cli.commands.show.text import tabulated
 
     before, after = _read(old), _read(new)
+    if isinstance(before, Rig) or isinstance(after, Rig):
+        _compare_rigs(before, after, plot, as_json)
+        return
     found = find_drift(before, after)
     if plot is not None:
         size = before.image_size or after.image_size
         assert size is not None
-        write_plot(plot, draw_drift, found, size)
+        write_plot(plot, draw_drift, {"": (found, size)})
     models = [camera_of(camera).model for camera in (before, after)]
     if found.different and models[0] != models[1]:
         note(
@@ -80,14 +91,49 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
         click.get_current_context().exit(_DIFFERENT)
 
 
-def _read(name: str) -> Calibration | Camera:
-    """A calibration with its points, or any camera file; without a covariance it is taken as exact."""
+def _compare_rigs(
+    old: Calibration | Camera | Rig, new: Calibration | Camera | Rig, plot: str | None, as_json: bool
+) -> None:
+    """Compare two rigs; the exit status is that of the answer."""
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.rig_drift import find_rig_drift
+    from neurocal_cli.commands.show.drift_report import (
+        draw_drift,
+        rig_drift_json,
+        rig_drift_lines,
+        rig_drift_tables,
+    )
+    from neurocal_cli.commands.show.text import tabulated
+
+    if not (isinstance(old, Rig) and isinstance(new, Rig)):
+        raise InputError("one file is a rig and the other one camera; give two of a kind")
+    found = find_rig_drift(old, new)
+    if plot is not None:
+        sizes = {name: old.cameras[name].image_size or new.cameras[name].image_size for name in found.cameras}
+        panels = {name: (one, sizes[name]) for name, one in found.cameras.items()}
+        write_plot(plot, draw_drift, panels, found.limit)
+    answer(
+        as_json,
+        lambda: rig_drift_json(found),
+        lambda: tabulated(rig_drift_tables(found), rig_drift_lines(found)),
+    )
+    if found.different:
+        click.get_current_context().exit(_DIFFERENT)
+
+
+def _read(name: str) -> Calibration | Camera | Rig:
+    """A calibration with its points, a rig, or any camera file; one without covariance is taken as exact."""
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_tree import calibration_from_field
     from neurocal_cli.files.exchange.reading import read_given_camera
+    from neurocal_cli.files.file_storage import read_tree
+    from neurocal_cli.files.rig_yaml import rig_from_field
 
     try:
-        camera: Calibration | Camera = read_calibration(name)
+        root = read_tree(name)
+        if "stereo" in root or "rig" in root:
+            return rig_from_field(root)
+        camera: Calibration | Camera = calibration_from_field(root)
     except FormatError:
         if name == "-":
             raise

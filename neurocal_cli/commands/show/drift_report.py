@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.drift import SHARE, Drift
+from neurocal_cli.calibration.rig.rig_drift import RigDrift
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.figure import ACCENT, colour_bar, picture, style
+from neurocal_cli.commands.show.figure import ACCENT, colour_bar, picture, plain, style
 from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
@@ -54,9 +56,53 @@ def drift_lines(drift: Drift) -> list[str]:
         f"{two_digits(drift.std[drift.worst])} px",
         f"  scale: {with_std(100 * scale[0], 100 * scale[1])} %",
         f"  image centre: {moves[0]} px in u, {moves[1]} px in v",
-        f"  chance: {_chance(drift)} of the calibrations of an unchanged camera differ as much; the limit is "
-        f"{100 * SHARE:g} %",
+        f"  chance: {_chance(drift.share)} of the calibrations of an unchanged camera differ as much; the "
+        f"limit is {100 * SHARE:g} %",
     ]
+
+
+def rig_drift_tables(drift: RigDrift) -> list[Table]:
+    """The differences of the cameras, and those of their poses, with the chance of each."""
+    images = [["camera", "difference rms [px]", "std [px]", "chance"]]
+    for name, camera in drift.cameras.items():
+        images.append([name, two_digits(camera.rms_px), two_digits(camera.rms_std), _chance(camera.share)])
+    unit = f" [{drift.unit}]"
+    poses = [["pose", "turn [mrad]", "std", f"shift{unit}", "std", f"baseline{unit}", "chance"]]
+    for name, pose in drift.poses.items():
+        sizes = (1000 * pose.turn, 1000 * pose.turn_std, pose.shift, pose.shift_std)
+        cells = [two_digits(float(np.linalg.norm(one))) for one in sizes]
+        poses.append([name, *cells, with_std(pose.baseline, pose.baseline_std), _chance(pose.share)])
+    return [images, poses]
+
+
+def rig_drift_lines(drift: RigDrift) -> list[str]:
+    """The judgement on a rig in words."""
+    told = [f"{name} has changed" for name in drift.changed]
+    told += [f"{name} has moved relative to {next(iter(drift.cameras))}" for name in drift.moved]
+    return [
+        f"{'different' if told else 'the same within chance'}{': ' if told else ''}{', '.join(told)}",
+        f"  a chance below {100 * drift.limit:.2g} % is a change; so unchanged rigs are called different in "
+        f"at most {100 * SHARE:g} % of the cases",
+    ]
+
+
+def rig_drift_json(drift: RigDrift) -> dict[str, Any]:
+    """The judgement on a rig and the numbers behind it."""
+    cameras = {
+        name: drift_json(one) | {"different": name in drift.changed, "limit": drift.limit}
+        for name, one in drift.cameras.items()
+    }
+    poses = {
+        name: {
+            "different": name in drift.moved,
+            "share": one.share,
+            "turn_rad": {"value": one.turn.tolist(), "std": one.turn_std.tolist()},
+            "shift": {"value": one.shift.tolist(), "std": one.shift_std.tolist()},
+            "baseline": {"value": one.baseline, "std": one.baseline_std},
+        }
+        for name, one in drift.poses.items()
+    }
+    return {"different": drift.different, "limit": drift.limit, "cameras": cameras, "poses": poses}
 
 
 def since_line(drift: Drift | None) -> str:
@@ -66,7 +112,7 @@ def since_line(drift: Drift | None) -> str:
     word = "no longer holds" if drift.different else "still holds"
     return (
         f"the calibration {word}: calibrated from these points, the camera differs by {_in_pixels(drift)}; "
-        f"{_chance(drift)} of unchanged cameras differ as much"
+        f"{_chance(drift.share)} of unchanged cameras differ as much"
     )
 
 
@@ -74,10 +120,10 @@ def _in_pixels(drift: Drift) -> str:
     return f"{two_digits(drift.rms_px)} px rms over the image, std {two_digits(drift.rms_std)} px"
 
 
-def _chance(drift: Drift) -> str:
-    if drift.share < _SURELY:
+def _chance(share: float) -> str:
+    if share < _SURELY:
         return f"less than {100 * _SURELY:g} %"
-    return f"{format(100 * drift.share, '.0f' if drift.share > _ROUND else '.1g')} %"
+    return f"{format(100 * share, '.0f' if share > _ROUND else '.1g')} %"
 
 
 def drift_json(drift: Drift) -> dict[str, Any]:
@@ -148,12 +194,22 @@ def _image_table(drift: Drift) -> Table:
     return rows
 
 
-def draw_drift(drift: Drift, size: tuple[int, int], kind: str = "png") -> bytes:
-    """Draw the differences over the image, in pixels and in standard deviations."""
+def draw_drift(
+    drifts: Mapping[str, tuple[Drift, tuple[int, int]]], limit: float = SHARE, kind: str = "png"
+) -> bytes:
+    """Draw the differences over the images, in pixels and in standard deviations.
+
+    The cameras have names, and the sizes of their images; a single one may have the name "".
+    """
 
     def draw(figure: Figure) -> None:
+        panels = figure.subplots(2, len(drifts), squeeze=False)
+        for pair, (name, (drift, size)) in zip(panels.T, drifts.items(), strict=True):
+            draw_one(pair, name, drift, size)
+
+    def draw_one(pair: Sequence[Axes], name: str, drift: Drift, size: tuple[int, int]) -> None:
         length, ratio = drift.length, drift.length / np.maximum(drift.std, 1e-300)
-        first, second = figure.subplots(2, 1)
+        first, second = pair
         _map(first, drift, length, "px")
         longest = float(length.max(initial=1e-300))
         enlarged = _LONGEST * size[0] / longest
@@ -164,19 +220,20 @@ def draw_drift(drift: Drift, size: tuple[int, int], kind: str = "png") -> bytes:
             *drift.pixels[some].T, *drift.difference[some].T,
             color="white", angles="xy", scale_units="xy", scale=1 / enlarged, width=0.005,
         )  # fmt: skip
-        style(first, f"New minus old pixel of a ray, {enlarged:,.2g} times enlarged")
+        head = f"{plain(name)}\n" if name else ""
+        style(first, f"{head}New minus old pixel of a ray, {enlarged:,.2g} times enlarged")
         first.grid(False)
         _map(second, drift, ratio, "standard deviations")
-        second.tricontour(*drift.pixels.T, ratio, levels=[_STRONG], colors=ACCENT)
+        second.tricontour(drift.pixels[:, 0], drift.pixels[:, 1], ratio, levels=[_STRONG], colors=ACCENT)
         second.plot(*drift.pixels[drift.worst], "o", color=ACCENT, fillstyle="none", markersize=10)
-        word = "different" if drift.different else "the same"
-        style(second, f"In std of both: {word} (line: {_STRONG:g}, circle: most)")
+        word = "different" if drift.share < limit else "the same"
+        style(second, f"{head}In std of both: {word} (line: {_STRONG:g}, circle: most)")
         second.grid(False)
         for axes in (first, second):
             axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal")
             axes.set(xlabel="u [px]", ylabel="v [px]")
 
-    return picture(draw, (5.2, 7.6), 0.1, kind)
+    return picture(draw, (5.2 * len(drifts), 7.6), 0.1, kind)
 
 
 def _map(axes: Axes, drift: Drift, values: Array, unit: str) -> None:

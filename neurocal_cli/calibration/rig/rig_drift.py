@@ -1,10 +1,12 @@
-"""Whether a camera of a rig has moved relative to the first one since an earlier calibration."""
+"""Whether the cameras of a rig, or their poses, have changed since an earlier calibration."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from neurocal_cli.calibration.drift import FEW_VIEWS, SHARE, tail
+from neurocal_cli.calibration.drift import FEW_VIEWS, SHARE, Drift, find_drift, tail
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_jacobian, rotation_vector
@@ -30,6 +32,58 @@ class PoseDrift:
     def different(self) -> bool:
         """Whether the camera has moved."""
         return self.share < SHARE
+
+
+@frozen_dataclass(eq=False)
+class RigDrift:
+    """What changed from an old calibration of a rig to a new one."""
+
+    cameras: Mapping[str, Drift]
+    poses: Mapping[str, PoseDrift]  # of all cameras but the first, relative to it
+    unit: str  # of lengths
+
+    @property
+    def limit(self) -> float:
+        """Share of pairs of calibrations below which one of the answers is no chance."""
+        return SHARE / (len(self.cameras) + len(self.poses))
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Names of the cameras that have changed."""
+        return tuple(name for name, one in self.cameras.items() if one.share < self.limit)
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """Names of the cameras that have moved relative to the first one."""
+        return tuple(name for name, one in self.poses.items() if one.share < self.limit)
+
+    @property
+    def different(self) -> bool:
+        """Whether the rig has changed: unchanged ones are called different in one of 1000 cases."""
+        return bool(self.changed or self.moved)
+
+
+def find_rig_drift(old: Rig, new: Rig) -> RigDrift:
+    """Compare a new calibration of a rig with an old one: each camera, and its pose relative to the first.
+
+    Raises
+    ------
+    InputError
+        The rigs have other cameras, or a camera or a pose cannot be compared; the message names it.
+    """
+    if set(old.cameras) != set(new.cameras):
+        raise InputError(
+            f"the rigs have different cameras: {', '.join(old.cameras)}, and {', '.join(new.cameras)}; "
+            "give the cameras of both the same names"
+        )
+    cameras = {}
+    for name, camera in old.cameras.items():
+        try:
+            cameras[name] = find_drift(camera, new.cameras[name])
+        except InputError as error:
+            raise InputError(f"camera {name}: {error}") from error
+    poses = {name: find_pose_drift(old, new, name) for name in old.cameras if name != old.first}
+    return RigDrift(cameras, poses, old.unit)
 
 
 def find_pose_drift(old: Rig, new: Rig, name: str) -> PoseDrift:

@@ -11,8 +11,8 @@ from support.rigs import RigScene, random_rig, sides
 from neurocal_cli import Pose
 from neurocal_cli.calibration.drift import SHARE
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
-from neurocal_cli.calibration.rig.pose_drift import find_pose_drift
 from neurocal_cli.calibration.rig.rig import Rig, of_two
+from neurocal_cli.calibration.rig.rig_drift import find_pose_drift, find_rig_drift
 from neurocal_cli.errors import InputError
 
 
@@ -42,8 +42,23 @@ def test_a_camera_that_turned_and_one_that_moved_are_told_from_one_that_did_not(
     assert apart.baseline == pytest.approx(expected, abs=4 * apart.baseline_std)
 
 
+def test_what_changed_in_a_rig_is_named() -> None:
+    scene = random_rig(np.random.default_rng(3), "verging", 10)
+    old, new = calibrated(scene, 1), again(scene, 2)
+    same = find_rig_drift(old, calibrated(new, 2))
+    assert (same.changed, same.moved, same.different) == ((), (), False)
+    turned = replace(new, rig=Pose(Pose.from_euler(0.0, 0.006, 0.0, np.zeros(3)).R @ new.rig.R, new.rig.t))
+    assert find_rig_drift(old, calibrated(turned, 3)).moved == ("right",)
+    left, right = new.cameras
+    longer = replace(left, alpha_u=1.01 * left.alpha_u, alpha_v=1.01 * left.alpha_v)
+    assert "left" in find_rig_drift(old, calibrated(replace(new, cameras=(longer, right)), 3)).changed
+
+
 def test_rigs_that_cannot_be_compared_are_refused() -> None:
     rig = calibrated(random_rig(np.random.default_rng(3), "verging", 10), 1)
+    renamed = replace(rig, cameras={f"{name}1": camera for name, camera in rig.cameras.items()})
+    with pytest.raises(InputError, match="different cameras: left, right, and left1, right1"):
+        find_rig_drift(rig, renamed)
     with pytest.raises(InputError, match="relative to left"):
         find_pose_drift(rig, replace(rig, cameras=dict(reversed(rig.cameras.items()))), "right")
     unknown = replace(rig, covariance=np.full((6, 6), np.nan))
