@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -105,12 +106,16 @@ def name_some(names: Iterable[object]) -> str:
 
 def in_sequence(names: tuple[str, ...]) -> list[int]:
     """Indices that sort names of views in natural order, in which img2 comes before img10."""
+    return list(_sequence(names))
 
+
+@lru_cache(maxsize=4)  # each rival asks for it
+def _sequence(names: tuple[str, ...]) -> tuple[int, ...]:
     def key(place: int) -> list[tuple[bool, int, str]]:
         parts = re.findall(r"\d+|\D+", names[place])
         return [(not part[0].isdecimal(), int(part) if part[0].isdecimal() else 0, part) for part in parts]
 
-    return sorted(range(len(names)), key=key)
+    return tuple(sorted(range(len(names)), key=key))
 
 
 def image_diagonal(points: Correspondences) -> float:
