@@ -12,15 +12,28 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
+from neurocal_cli.calibration.rig.frames import FrameNames
 from neurocal_cli.calibration.rig.pairing import ViewPairs
 from neurocal_cli.camera.geometry import Array, median
 
 _MOST_HYPOTHESES = 200  # offers that are tried
 
 
-def with_agreeing_poses(
-    left: Calibration, right: Calibration, views: ViewPairs
-) -> tuple[Calibration, Calibration]:
+def with_agreeing_poses(cameras: list[Calibration], views: FrameNames) -> list[Calibration]:
+    """Cameras with the poses of flat targets on which they agree with others."""
+    if not any(camera.second_poses for camera in cameras):
+        return cameras
+    frames = [dict(zip(own.tolist(), camera.points.view_names, strict=True))
+              for own, camera in zip(views.of_views, cameras, strict=True)]  # fmt: skip
+    for a in range(len(cameras)):
+        for b in range(a + 1, len(cameras)):
+            both = tuple((frames[a][k], frames[b][k]) for k in frames[a].keys() & frames[b].keys())
+            if both:
+                cameras[a], cameras[b] = _of_two(cameras[a], cameras[b], ViewPairs(both))
+    return cameras
+
+
+def _of_two(left: Calibration, right: Calibration, views: ViewPairs) -> tuple[Calibration, Calibration]:
     """Both cameras, with the poses of paired views on which they agree, and no second poses of these."""
     if not (left.second_poses or right.second_poses):
         return left, right

@@ -20,24 +20,19 @@ from neurocal_cli.calibration.rig.rivals import log_evidence, named_cause
 from neurocal_cli.camera.geometry import Array, rotation_vector
 
 
-def evidence_by_parts(still: RigFit, fit: RigFit, found: Named) -> float:
-    """Log odds of a cause; of a second geometry by the fits of both parts.
+def is_common(found: Named, still: RigFit, fit: RigFit, n: int) -> bool:
+    """Whether a cause is more probable than n views that contradict the others, each for reasons of its own.
 
-    `fit` is that of some views, and `still` has all of them at its cameras and rig (`at_fit`).
+    `fit` is without these views, and `still` has all at its cameras and rig (`at_fit`). The evidence of a
+    second geometry is that of the fits of both parts.
     """
-    if found.cause not in TWO_GEOMETRIES:
-        return found.evidence
-    problem = still.problem
-    own = scatter(_by_itself(problem, fit, found))[0]
     squares, degrees = scatter(still)
-    choices = float(np.log(problem.together.sum() * len(problem.cameras)))
-    return log_evidence(squares, scatter(fit)[0] + own, degrees, int(of_rig(still).sum())) - choices
-
-
-def evidence_of_odd(still: RigFit, fit: RigFit, n: int) -> float:
-    """Log odds of n views that contradict the others, each for reasons of its own."""
-    squares, degrees = scatter(still)
-    return log_evidence(squares, scatter(fit)[0], degrees, 6 * n) if degrees else 0.0
+    rest, evidence = scatter(fit)[0], found.evidence
+    if found.cause in TWO_GEOMETRIES:
+        own = scatter(_by_itself(still.problem, fit, found))[0]
+        choices = float(np.log(still.problem.together.sum() * len(still.problem.cameras)))
+        evidence = log_evidence(squares, rest + own, degrees, int(of_rig(still).sum())) - choices
+    return evidence > log_evidence(squares, rest, degrees, 6 * n)
 
 
 def seen_again(problem: RigProblem, fit: RigFit, found: Named) -> Named:

@@ -20,7 +20,7 @@ from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.board import with_board
 from neurocal_cli.calibration.rig.causes import LATE_CAMERA, TAKEN, TWO_GEOMETRIES
-from neurocal_cli.calibration.rig.changes import evidence_by_parts, evidence_of_odd, of_rig, seen_again
+from neurocal_cli.calibration.rig.changes import is_common, of_rig, seen_again
 from neurocal_cli.calibration.rig.combine import rig_problem
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED
 from neurocal_cli.calibration.rig.covariance import (
@@ -42,7 +42,6 @@ from neurocal_cli.calibration.rig.edges import (
 )
 from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames, refuse_apart
 from neurocal_cli.calibration.rig.motion import timed
-from neurocal_cli.calibration.rig.pairing import ViewPairs
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.refinement import adjusted
 from neurocal_cli.calibration.rig.result import RigAssembly
@@ -96,7 +95,7 @@ def fit_rig(
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
     names = list(cameras)
     views = views or connected_frames({name: camera.points for name, camera in cameras.items()})
-    cameras = dict(zip(names, _with_agreeing_poses(list(cameras.values()), views), strict=True))
+    cameras = dict(zip(names, with_agreeing_poses(list(cameras.values()), views), strict=True))
     problem = rig_problem(list(cameras.values()), views.of_views)
     edges = examined(problem, views.seen)
     start = connected(edges, names)
@@ -154,9 +153,7 @@ def _without_contradictions(
         # The others tell whether the suspects have a cause in common, or which of them fit after all.
         still = at_fit(_detached(problem, _named(left_out), names), fit)
         found = named_cause(still, names, free=of_rig(still))[0]
-        common = found is not None and (
-            evidence_by_parts(still, fit, found) > evidence_of_odd(still, fit, len(suspects))
-        )
+        common = found is not None and is_common(found, still, fit, len(suspects))
         if held := suspects if common else suspects & set(_views(problem, fitting(still))):
             left_out = {view: why for view, why in left_out.items() if view not in held}
             fit, warnings = fitted()
@@ -179,20 +176,6 @@ def _without_contradictions(
             left_out = {view: why for view, why in left_out.items() if view not in held}
             fit, warnings = fitted()
     return fit, left_out, warnings
-
-
-def _with_agreeing_poses(cameras: list[Calibration], views: FrameNames) -> list[Calibration]:
-    """Cameras with the poses of flat targets on which they agree with others."""
-    if not any(camera.second_poses for camera in cameras):
-        return cameras
-    frames = [dict(zip(own.tolist(), camera.points.view_names, strict=True))
-              for own, camera in zip(views.of_views, cameras, strict=True)]  # fmt: skip
-    for a in range(len(cameras)):
-        for b in range(a + 1, len(cameras)):
-            both = tuple((frames[a][k], frames[b][k]) for k in frames[a].keys() & frames[b].keys())
-            if both:
-                cameras[a], cameras[b] = with_agreeing_poses(cameras[a], cameras[b], ViewPairs(both))
-    return cameras
 
 
 def _detached(problem: RigProblem, left_out: Mapping[tuple[int, str], str], names: list[str]) -> RigProblem:
