@@ -68,20 +68,14 @@ def relative_poses(problem: RigProblem, rig: Pose) -> RelativePoses | None:
     solved = solve_scaled(A, np.concatenate([bordered, np.broadcast_to(np.eye(6), A.shape)], axis=2))
     if not np.isfinite(solved).all():
         return None
-    views = zip(
-        problem.observations, problem.own_normal, (problem.paired_left, problem.paired_right), strict=True
-    )
-    counts, larger = zip(
-        *(
-            (n := seen.equations_by_view[which], normal[which, -1, -1] / np.maximum(n - 6, 1.0))
-            for seen, normal, which in views
-        ),
-        strict=True,
-    )
-    times = np.maximum(*larger)
+    sides = zip(problem.observations, problem.own_normal, strict=True)
+    counts = [seen.equations_by_view for seen in problem.observations]
+    larger = [own[:, -1, -1] / np.maximum(seen.equations_by_view - 6, 1.0) for seen, own in sides]
+    left, right = problem.paired_left, problem.paired_right
+    times = np.maximum(larger[0][left], larger[1][right])
     times = np.where(times > _MUCH_LARGER, times, 1.0)[:, None, None]
     return RelativePoses(
-        solved[..., -7], solved[..., :-7], times * solved[..., -6:], counts[0] + counts[1],
+        solved[..., -7], solved[..., :-7], times * solved[..., -6:], counts[0][left] + counts[1][right],
         arrow.reduced()[0], np.swapaxes(bordered, 1, 2) @ solved[..., :-6],
     )  # fmt: skip
 
