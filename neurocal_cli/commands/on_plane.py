@@ -58,7 +58,6 @@ def points_on_plane(
     of_camera, of_pixel = np.sqrt(np.median(variances, axis=0)).tolist() if len(variances) else [np.nan] * 2
     if as_json:
         parts = {"calibration": of_camera, "pixels": of_pixel}
-        parts = {name: float(std) if np.isfinite(std) else None for name, std in parts.items()}
         print_summary({"n_points": len(variances) + missed, "n_behind": missed, "std": parts})
         return
     told = [plural(len(variances) + missed, "point")]

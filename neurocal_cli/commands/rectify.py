@@ -195,20 +195,18 @@ class _Work:
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
         from neurocal_cli.calibration.rig.rectification import row_error_of_rig
-        from neurocal_cli.commands.show.text import number_or_none
 
         self.summary["along"] = self.along
         error = self.own_rows = row_error_of_rig(self.rig, self.pair)
         if error is not None:
             points = f"the rig's own {error.n_points} points"
             self._tell(f"{self.along} of {points} differ by {error.rms_px:.3g} px rms")
-            self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
+            self.summary["rig"] = {"n_points": error.n_points, "rms_px": error.rms_px}
         preparation.warn_of_poor(self.rig)
 
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
         from neurocal_cli.calibration.rig.rectification import row_error
-        from neurocal_cli.commands.show.text import number_or_none
         from neurocal_cli.files.points_csv import format_points
 
         if len(sides[0]) > 1:
@@ -219,8 +217,8 @@ class _Work:
         error = row_error(self.pair, moved[0], moved[1])
         self.summary["points"] = {
             "n_points": error.n_points,
-            "rms_px": number_or_none(error.rms_px),
-            "max_px": number_or_none(error.max_px),
+            "rms_px": error.rms_px,
+            "max_px": error.max_px,
         }
         self._tell(
             f"{self.along} of the {error.n_points} points given differ by {error.rms_px:.3g} px "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import shlex
 import sys
@@ -172,7 +173,7 @@ def concluding(
     As JSON, it is printed after them. In the end, exit if the training did not converge.
     """
     if (capture := _CAPTURE.get()) is not None:
-        capture.summaries.append(in_json(result))
+        capture.summaries.append(for_json(in_json(result)))
     if not as_json:
         with drawn_on(sys.stderr if capture is None else None):
             say(in_words(result))
@@ -233,9 +234,20 @@ def first_of(names: Sequence[str]) -> str:
 
 
 def print_summary(tree: dict[str, Any]) -> None:
-    """Print the summary of a result as JSON on stdout; None for numbers that do not exist."""
+    """Print the summary of a result as JSON on stdout; see `for_json`."""
     end_waiting()
-    click.echo(json.dumps(tree, indent=2, allow_nan=False))
+    click.echo(json.dumps(for_json(tree), indent=2, allow_nan=False))
+
+
+def for_json(value: Any) -> Any:
+    """The same as values of JSON: arrays become lists, and numbers that are not finite None."""
+    if isinstance(value, Mapping):
+        return {key: for_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [for_json(entry) for entry in value]
+    if hasattr(value, "tolist"):  # of NumPy
+        return for_json(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class ProgressBar(AbstractContextManager["ProgressBar"]):

@@ -276,11 +276,9 @@ class _Undistorting:
 
     def summary(self) -> dict[str, Any]:
         """Summary of the results for programs."""
-        import numpy as np
-
         shown, spanned = (None, None) if self.size is None else self._fields_of_view(self.size)
-        camera = {key: np.asarray(value).tolist() for key, value in self._described().items()}
-        return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
+        angles = {"shown_deg": shown, "spanned_deg": spanned}
+        return {"n_left_out": self.left_out, **angles, "camera": self._described()}
 
     def write_camera(self, path: str) -> None:
         """Write the camera of the undistorted results."""

@@ -10,6 +10,7 @@ import pytest
 
 from neurocal_cli import Calibration, Camera, Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.commands.show.camera_report import calibration_json
+from neurocal_cli.commands.streams import for_json
 from neurocal_cli.files import calibration_yaml
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.result_files import write_calibration
@@ -115,7 +116,7 @@ def test_files_have_both_poses(
 
 def test_json_has_both_poses(far: tuple[list[Pose], Calibration]) -> None:
     _, found = far
-    written = calibration_json(found)["second_poses"]
+    written = for_json(calibration_json(found)["second_poses"])
     assert list(written) == list(found.second_poses)
     for name, (first, second) in written.items():
         assert first["R"] == found.views[name].pose.R.tolist()

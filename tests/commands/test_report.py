@@ -14,6 +14,7 @@ from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, e
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.commands.show.camera_report import calibration_report, evaluation_json, evaluation_tables
 from neurocal_cli.commands.show.text import align, rounded
+from neurocal_cli.commands.streams import for_json
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,7 @@ def test_json_has_null_for_an_error_that_does_not_exist() -> None:
     behind = -pose_of(0).R.T @ pose_of(0).t - 50 * pose_of(0).R[2]
     points = Correspondences(behind[None], np.zeros((1, 2)), ["view00"])
     evaluation = evaluate_camera(made_calibration(), points)
-    values = evaluation_json(evaluation)
+    values = for_json(evaluation_json(evaluation))
     assert values["rmse_px"] is None
     assert values["views"] == {"view00": None}
     json.dumps(values, allow_nan=False)

@@ -9,7 +9,7 @@ from neurocal_cli.calibration.advice import Advice, Candidate
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.advice import RigAdvice
 from neurocal_cli.calibration.verdict.findings import two_digits
-from neurocal_cli.commands.show.text import number_or_none, printable
+from neurocal_cli.commands.show.text import printable
 
 _ACROSS = ("far left", "left", "middle", "right", "far right")
 _DOWN = ("very top", "top", "middle", "bottom", "very bottom")
@@ -77,14 +77,14 @@ def rig_advice_lines(advice: RigAdvice) -> list[str]:
 def rig_advice_json(advice: RigAdvice) -> dict[str, Any]:
     """The same as values for JSON."""
     return {
-        "weakest_share": number_or_none(advice.share),
+        "weakest_share": advice.share,
         "unit": advice.unit,
         "views": [
             {
-                "cameras": list(tie.cameras),
+                "cameras": tie.cameras,
                 **_view_json(tie.view),
-                "std": number_or_none(tie.before),
-                "std_after": number_or_none(tie.after),
+                "std": tie.before,
+                "std_after": tie.after,
             }
             for tie in advice.views
         ],
@@ -93,23 +93,23 @@ def rig_advice_json(advice: RigAdvice) -> dict[str, Any]:
 
 def _view_json(view: Candidate) -> dict[str, Any]:
     return {
-        "position": view.position.tolist(),
+        "position": view.position,
         "width": view.width,
         "tilt_deg": view.tilt,
         "nearer_side_deg": view.way,
         "roll_deg": view.roll,
-        "rotation": view.pose.R.tolist(),
-        "translation": view.pose.t.tolist(),
-        "outline": view.outline.tolist(),
+        "rotation": view.pose.R,
+        "translation": view.pose.t,
+        "outline": view.outline,
     }
 
 
 def advice_json(advice: Advice) -> dict[str, Any]:
     """The advice as values for JSON."""
     return {
-        "worst_px": number_or_none(advice.before),
+        "worst_px": advice.before,
         "views": [
-            {**_view_json(view), "worst_px": number_or_none(after)}
+            {**_view_json(view), "worst_px": after}
             for view, after in zip(advice.views, advice.after, strict=True)
         ],
     }

@@ -19,7 +19,6 @@ from neurocal_cli.commands.show.text import (
     align_views,
     joined,
     labelled,
-    number_or_none,
     outcome_json,
     parameters,
     parameters_json,
@@ -175,7 +174,7 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
     """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
     return {
         "camera_name": calibration.camera_name,
-        "image_size": calibration.image_size and list(calibration.image_size),
+        "image_size": calibration.image_size,
         "n_points": len(calibration.points),
         "n_rejected": calibration.n_rejected,
         "unit": calibration.unit,
@@ -183,14 +182,14 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         "method": calibration.method,
         "distortion": calibration.distortion_model,
         "parameters": parameters_json(calibration),
-        "rmse_px": number_or_none(calibration.rmse_px),
-        "max_px": number_or_none(calibration.max_px),
-        "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
+        "rmse_px": calibration.rmse_px,
+        "max_px": calibration.max_px,
+        "views": {name: view.rmse_px for name, view in calibration.views.items()},
         "second_poses": {
             name: [_pose_json(one) for one in (calibration.views[name], second)]
             for name, second in calibration.second_poses.items()
         },
-        "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
+        "lens_choice": calibration.lens_choice,
         "positions": _positions_json(calibration),
         "target": target_json(calibration.target, calibration.unit),
         **outcome_json(calibration),
@@ -201,18 +200,14 @@ def _positions_json(calibration: Calibration) -> dict[str, Any]:
     """Of a single view: the position of the camera in the world, with its std."""
     if len(calibration.views) != 1 or not len(calibration.points):
         return {}
-    return {
-        view: {
-            name: {"value": value, "std": number_or_none(std)}
-            for name, value, std in _position(calibration, view)
-        }
-        for view in calibration.views
-    }
+    (view,) = calibration.views
+    places = _position(calibration, view)
+    return {view: {name: {"value": value, "std": std} for name, value, std in places}}
 
 
 def _pose_json(view: ViewResult) -> dict[str, Any]:
     """A pose, and its probability where the flat target may be tilted the other way."""
-    return {"probability": view.probability, "R": view.pose.R.tolist(), "t": view.pose.t.tolist()}
+    return {"probability": view.probability, "R": view.pose.R, "t": view.pose.t}
 
 
 def target_lines(target: Target | None, unit: str) -> list[str]:
@@ -254,18 +249,18 @@ def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
     if target is None:
         return None
     shift, turn = target.displaced()
-    planes = {"planes_shift": shift, "planes_turn_deg": float(np.degrees(turn))}
+    planes = {"planes_shift": shift, "planes_turn_deg": np.degrees(turn)}
     return {
         "unit": unit,
-        "flat": bool(target.flat),
-        "bend": number_or_none(float(target.bend())),
-        "stretch": number_or_none(float(target.stretch())),
-        "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
-        "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
+        "flat": target.flat,
+        "bend": target.bend(),
+        "stretch": target.stretch(),
+        "offset_rms": np.sqrt((target.offsets**2).sum(axis=1).mean()),
+        "std_rms": np.sqrt((target.std**2).mean()),
         "n_points": len(target.found),
         **(planes if target.plane.any() else {}),
         **({} if target.bends is None else {"bend_of_views_rms": target.bend_of_views()}),
-        **({} if target.stated is None else {"stated_std_factor": float(target.sizes["stated"])}),
+        **({} if target.stated is None else {"stated_std_factor": target.sizes["stated"]}),
     }
 
 
@@ -291,9 +286,9 @@ def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None
     return {
         "n_points": evaluation.n_points,
         "n_behind": evaluation.n_behind,
-        **{name: number_or_none(getattr(evaluation, name)) for name in names},
-        "views": {name: number_or_none(view.rmse_px) for name, view in evaluation.views.items()},
-        "fitted_views": list(evaluation.fitted_views),
+        **{name: getattr(evaluation, name) for name in names},
+        "views": {name: view.rmse_px for name, view in evaluation.views.items()},
+        "fitted_views": evaluation.fitted_views,
         **verdict_json(verdict),
     }
 

@@ -18,7 +18,6 @@ from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
     labelled,
-    number_or_none,
     parameters,
     rounded,
     with_std,
@@ -128,9 +127,9 @@ def _chance(share: float) -> str:
 
 def drift_json(drift: Drift) -> dict[str, Any]:
     """The judgement and the numbers behind it."""
-    u, v = drift.pixels[drift.worst].tolist()
-    at = {"u": u, "v": v, "px": float(drift.length[drift.worst]), "std_px": float(drift.std[drift.worst])}
-    changes = zip(_CHANGES, drift.changes.tolist(), drift.changes_std.tolist(), strict=True)
+    u, v = drift.pixels[drift.worst]
+    at = {"u": u, "v": v, "px": drift.length[drift.worst], "std_px": drift.std[drift.worst]}
+    changes = zip(_CHANGES, drift.changes, drift.changes_std, strict=True)
     return {
         "different": drift.different,
         "share": drift.share,
@@ -144,11 +143,10 @@ def drift_json(drift: Drift) -> dict[str, Any]:
 
 def details_json(old: Calibration | Camera, new: Calibration | Camera, drift: Drift) -> dict[str, Any]:
     """The parameters that both cameras have, and the differences over the image; nan becomes None."""
-    rows = zip(drift.pixels.tolist(), drift.difference.tolist(), drift.std.tolist(), strict=True)
+    rows = zip(drift.pixels, drift.difference, drift.std, strict=True)
     return {
         "parameters": {
-            name: {"old": a, "new": b, "std": number_or_none(std)}
-            for name, (a, b, std) in _compared(old, new).items()
+            name: {"old": a, "new": b, "std": std} for name, (a, b, std) in _compared(old, new).items()
         },
         "image": [{"u": u, "v": v, "du": du, "dv": dv, "std_px": std} for (u, v), (du, dv), std in rows],
     }

@@ -16,7 +16,6 @@ from neurocal_cli.commands.show.text import (
     align,
     joined,
     number,
-    number_or_none,
     parameters,
     parameters_json,
     with_std,
@@ -137,7 +136,7 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         found["stereo"] = {
             method: {
                 **_triangulated_json(one.by_view),
-                "baseline": number_or_none(one.baseline),
+                "baseline": one.baseline,
                 "rig": None if one.rig is None else _triangulated_json(one.rig),
             }
             for method, one in comparison.stereo.items()
@@ -151,7 +150,7 @@ def _camera_json(one: Compared) -> dict[str, Any]:
         return {"problem": one.problem}
     return {
         "rmse_px": calibration.rmse_px,
-        "held_out_px": number_or_none(one.held_out_px),
+        "held_out_px": one.held_out_px,
         "seconds": one.seconds,
         "distortion_model": calibration.distortion_model,
         "parameters": parameters_json(calibration),
@@ -159,7 +158,7 @@ def _camera_json(one: Compared) -> dict[str, Any]:
 
 
 def _triangulated_json(errors: SpaceError) -> dict[str, float | None]:
-    return {"rmse": number_or_none(errors.rmse), "nsce": number_or_none(errors.nsce)}
+    return {"rmse": errors.rmse, "nsce": errors.nsce}
 
 
 def simulation_tables(
@@ -273,7 +272,7 @@ def simulation_json(
         "best_rmse_px": starts.best,
         "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
         "reached": starts.reached,
-        "rmse_px": {kind: _numbers(rms) for kind, rms in starts.rms.items()},
+        "rmse_px": starts.rms,
     }
     return {**counts, **noise_json(study), "random_starts": random_starts}
 
@@ -282,16 +281,16 @@ def noise_json(study: NoiseStudy) -> dict[str, Any]:
     """The study of noise for JSON."""
     return {
         "trials": study.trials,
-        "sigma": study.sigma.tolist(),
-        "parameters": list(study.names),
+        "sigma": study.sigma,
+        "parameters": study.names,
         "truth": _by_name(study, study.truth),
         "methods": {
             name: {
                 "error_without_noise": _by_name(study, one.exact),
-                "rms": {p: _numbers(one.rms[:, k]) for k, p in enumerate(study.names)},
-                "bias": {p: _numbers(one.bias[:, k]) for k, p in enumerate(study.names)},
+                "rms": {p: one.rms[:, k] for k, p in enumerate(study.names)},
+                "bias": {p: one.bias[:, k] for k, p in enumerate(study.names)},
                 "bound_for_1_px": _by_name(study, one.bound),
-                "failed": one.failed.tolist(),
+                "failed": one.failed,
             }
             for name, one in study.methods.items()
         },
@@ -303,19 +302,15 @@ def rates_json(study: RateStudy) -> dict[str, Any]:
     """The study of rates for JSON."""
     return {
         "data_sets": study.sets,
-        "rates_weights": study.rates_weights.tolist(),
-        "rates_gamma": study.rates_gamma.tolist(),
-        "converged": study.converged.tolist(),
-        "median_epochs": [_numbers(row) for row in study.epochs],
+        "rates_weights": study.rates_weights,
+        "rates_gamma": study.rates_gamma,
+        "converged": study.converged,
+        "median_epochs": study.epochs,
         "default": {"rate_weights": study.default[0], "rate_gamma": study.default[1]},
         "calibrated": study.calibrated,
-        "alpha_u_errors_in_std": _numbers(study.alpha_u),
+        "alpha_u_errors_in_std": study.alpha_u,
     }
 
 
-def _by_name(study: NoiseStudy, values: Any) -> dict[str, float | None]:
-    return dict(zip(study.names, _numbers(values), strict=True))
-
-
-def _numbers(values: Any) -> list[float | None]:
-    return [number_or_none(float(value)) for value in values]
+def _by_name(study: NoiseStudy, values: Any) -> dict[str, Any]:
+    return dict(zip(study.names, values, strict=True))

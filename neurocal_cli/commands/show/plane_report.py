@@ -7,7 +7,7 @@ from typing import Any
 
 from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.plane_points import PlaneErrors, Spread
-from neurocal_cli.commands.show.text import Table, number_or_none, printable, rounded, with_std
+from neurocal_cli.commands.show.text import Table, printable, rounded, with_std
 
 
 def plane_tables(errors: PlaneErrors | None, unit: str) -> list[Table]:
@@ -62,9 +62,9 @@ def positions_json(positions: Mapping[str, CameraPosition]) -> dict[str, Any]:
     """The same as values for JSON, with covariances."""
     return {
         name: {
-            "point": place.point.tolist(),
-            "std": [number_or_none(std) for std in place.std.tolist()],
-            "covariance": None if place.covariance is None else place.covariance.tolist(),
+            "point": place.point,
+            "std": place.std,
+            "covariance": place.covariance,
         }
         for name, place in positions.items()
     }

@@ -14,7 +14,6 @@ from neurocal_cli.commands.show.text import (
     align,
     four_digits,
     joined,
-    number_or_none,
     outcome_json,
     parameters,
     printable,
@@ -111,21 +110,12 @@ def rig_json(rig: Rig) -> dict[str, Any]:
     return {
         "cameras": {name: calibration_json(camera) for name, camera in rig.cameras.items()},
         "unit": rig.unit,
-        "poses": {
-            name: {
-                "R": pose.R.tolist(),
-                "t": pose.t.tolist(),
-                "std": {key: number_or_none(value) for key, value in rig.std[name].items()},
-            }
-            for name, pose in rig.poses.items()
-        },
-        "edges": [{"cameras": list(pair), "views": count} for pair, count in rig.edges.items()],
-        "delays": {
-            name: {"value": value, "std": number_or_none(std)} for name, (value, std) in rig.delays.items()
-        },
+        "poses": {name: {"R": pose.R, "t": pose.t, "std": rig.std[name]} for name, pose in rig.poses.items()},
+        "edges": [{"cameras": pair, "views": count} for pair, count in rig.edges.items()],
+        "delays": {name: {"value": value, "std": std} for name, (value, std) in rig.delays.items()},
         "timed": rig.timed,
-        "rmse_px": number_or_none(rig.rmse_px),
-        "max_px": number_or_none(rig.max_px),
+        "rmse_px": rig.rmse_px,
+        "max_px": rig.max_px,
         "left_out": [[*view, why] for view, why in rig.left_out.items()],
         **outcome_json(rig),
     }
@@ -162,7 +152,7 @@ def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
         "max": evaluation.largest,
         "fitted": evaluation.fitted,
         "cameras": {
-            name: {"n_points": count, "predicted_rmse_px": number_or_none(error)}
+            name: {"n_points": count, "predicted_rmse_px": error}
             for name, (count, error) in evaluation.predicted.items()
         },
         "frames": evaluation.frames,
@@ -186,11 +176,11 @@ def rig_study_json(study: RigStudy) -> dict[str, Any]:
     return {
         "trials": study.trials,
         "frames": len(study.rig.frames),
-        "sigma_px": list(study.sigma),
-        "rmse_px": list(study.rmse_px),
-        "place_mm": list(study.centre),
-        "rotation_rad": list(study.rotation),
-        "error_over_std": list(study.over_std),
+        "sigma_px": study.sigma,
+        "rmse_px": study.rmse_px,
+        "place_mm": study.centre,
+        "rotation_rad": study.rotation,
+        "error_over_std": study.over_std,
         "poses": {
             name: {"R": pose.R.tolist(), "t": pose.t.tolist()} for name, pose in study.rig.relative.items()
         },

@@ -19,7 +19,6 @@ from neurocal_cli.commands.show.text import (
     four_digits,
     joined,
     labelled,
-    number_or_none,
     outcome_json,
     parameters,
     printable,
@@ -128,19 +127,18 @@ def stereo_json(rig: StereoRig) -> dict[str, Any]:
         "left": calibration_json(rig.left),
         "right": calibration_json(rig.right),
         "unit": rig.unit,
-        "R": rig.R.tolist(),
-        "t": rig.t.tolist(),
+        "R": rig.R,
+        "t": rig.t,
         "baseline": rig.baseline,
         "parameters": {
-            name: {"value": value, "std": number_or_none(rig.std[name])}
-            for name, value in _pose_values(rig).items()
+            name: {"value": value, "std": rig.std[name]} for name, value in _pose_values(rig).items()
         },
-        "baseline_std": number_or_none(rig.std["baseline"]),
-        "rmse_px": number_or_none(rig.rmse_px),
-        "max_px": number_or_none(rig.max_px),
-        "pairs": [list(pair) for pair in rig.pairs],
+        "baseline_std": rig.std["baseline"],
+        "rmse_px": rig.rmse_px,
+        "max_px": rig.max_px,
+        "pairs": rig.pairs,
         "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
-        "delay": None if rig.delay is None else {"value": rig.delay[0], "std": number_or_none(rig.delay[1])},
+        "delay": None if rig.delay is None else {"value": rig.delay[0], "std": rig.delay[1]},
         **outcome_json(rig),
     }
 
@@ -200,9 +198,9 @@ def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
     return {
         **_error_json(evaluation.by_view),
         "unit": evaluation.unit,
-        "baseline": number_or_none(evaluation.baseline),
-        "pairs": [list(pair) for pair in evaluation.pairs],
-        "fitted_views": list(evaluation.fitted),
+        "baseline": evaluation.baseline,
+        "pairs": evaluation.pairs,
+        "fitted_views": evaluation.fitted,
         "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
         **verdict_json(evaluation.verdict),
@@ -213,8 +211,8 @@ def _error_json(error: SpaceError) -> dict[str, Any]:
     return {
         "n_points": error.n_points,
         "n_behind": error.n_behind,
-        **{name: number_or_none(getattr(error, name)) for name in _ERRORS},
-        "views": {name: number_or_none(rmse) for name, (_, rmse) in error.views.items()},
+        **{name: getattr(error, name) for name in _ERRORS},
+        "views": {name: rmse for name, (_, rmse) in error.views.items()},
         "depths": [
             {
                 "from": part.nearest,

@@ -137,11 +137,6 @@ def number(value: float, form: str) -> str:
     return format(value, form) if math.isfinite(value) else "-"
 
 
-def number_or_none(value: float) -> float | None:
-    """The number, or None if it is not finite, as JSON has no such numbers."""
-    return value if math.isfinite(value) else None
-
-
 def printable(name: str) -> str:
     """The name as printable text on one line, with other characters escaped."""
     return name if name.isprintable() else ascii(name)[1:-1]
@@ -164,7 +159,7 @@ def parameters_json(calibration: Calibration) -> dict[str, dict[str, Any]]:
     return {
         name: {
             "value": value,
-            "std": number_or_none(calibration.std.get(name, math.nan)),
+            "std": calibration.std.get(name, math.nan),
             "fixed": name in calibration.fixed,
         }
         for name, value in parameters(calibration).items()
@@ -174,9 +169,9 @@ def parameters_json(calibration: Calibration) -> dict[str, dict[str, Any]]:
 def outcome_json(result: Calibration | StereoRig | Rig) -> dict[str, Any]:
     """How the estimation of a result ended, for JSON."""
     return {
-        "converged": bool(result.converged),
+        "converged": result.converged,
         "stop_reason": str.__str__(result.stop_reason),
-        "warnings": list(result.warnings),
+        "warnings": result.warnings,
         **verdict_json(result.verdict),
     }
 
@@ -201,9 +196,8 @@ def verdict_json(verdict: Verdict | None) -> dict[str, Any]:
     """The entry `verdict` of a summary, empty without a verdict; measures that are not finite become None."""
     if verdict is None:
         return {}
-    measures = {name: number_or_none(value) for name, value in verdict.measures.items()}
-    reasons, advice = list(verdict.reasons), list(verdict.advice)
-    return {"verdict": {"word": verdict.word, "reasons": reasons, "advice": advice, "measures": measures}}
+    names = ("word", "reasons", "advice", "measures")
+    return {"verdict": {name: getattr(verdict, name) for name in names}}
 
 
 def facts(verdict: Verdict) -> str:

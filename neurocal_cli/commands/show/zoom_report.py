@@ -19,7 +19,6 @@ from neurocal_cli.commands.show.text import (
     joined,
     labelled,
     number,
-    number_or_none,
     parameters,
     rounded,
     verdict_json,
@@ -91,20 +90,20 @@ def network_rows(lens: ZoomLens) -> Table:
 def lens_json(lens: ZoomLens) -> dict[str, Any]:
     """The summary of a lens as JSON values; None for numbers that do not exist."""
     return {
-        "controls": list(lens.controls),
+        "controls": lens.controls,
         "n_settings": len(lens.settings),
-        "n_points": int(lens.counts.sum()),
-        "parameters": list(lens.names),
+        "n_points": lens.counts.sum(),
+        "parameters": lens.names,
         "distortion": lens.model,
-        "still": bool(lens.still),
-        "known_cameras": bool(lens.known),
-        "rmse_px": number_or_none(float(lens.rmse_px)),
-        "noise_floor_px": None if lens.known else number_or_none(lens.noise_floor_px),
-        "left_out_px": number_or_none(float(lens.left_out_px)),
+        "still": lens.still,
+        "known_cameras": lens.known,
+        "rmse_px": lens.rmse_px,
+        "noise_floor_px": None if lens.known else lens.noise_floor_px,
+        "left_out_px": lens.left_out_px,
         "members": len(lens.members),
         "target": target_json(lens.target, lens.unit),
-        "converged": bool(lens.converged),
-        "warnings": list(lens.warnings),
+        "converged": lens.converged,
+        "warnings": lens.warnings,
         **verdict_json(judge_lens(lens)),
     }
 
@@ -151,18 +150,18 @@ def evaluation_json(evaluation: LensEvaluation, verdict: Verdict) -> dict[str, A
     """An evaluation as JSON values; None for numbers that do not exist."""
     return {
         "n_points": evaluation.n_points,
-        "rmse_px": number_or_none(evaluation.rmse_px),
-        "max_px": number_or_none(evaluation.max_px),
+        "rmse_px": evaluation.rmse_px,
+        "max_px": evaluation.max_px,
         "settings": [
             {
                 **{name: setting.values.get(name) for name in CONTROLS},
                 "n_points": setting.n_points,
-                "rmse_px": number_or_none(setting.rmse_px),
-                "max_px": number_or_none(setting.max_px),
+                "rmse_px": setting.rmse_px,
+                "max_px": setting.max_px,
             }
             for setting in evaluation.settings
         ],
-        "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
+        "rivals": evaluation.baselines,
         **verdict_json(verdict),
     }
 
