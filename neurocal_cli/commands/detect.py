@@ -130,7 +130,8 @@ def detect(
     Boards with markers (ChArUco, AprilGrid) are found by these, and any part with two of them is used. The
     dictionary of a ChArUco board, and whether it has OpenCV's legacy pattern, are told from the image if they
     are not given. Vertices and mid-points are measured as on chessboards; on tags they are their corners
-    TAG:0 to TAG:3 and the mid-points of their edges TAG:e0 to TAG:e3.
+    TAG:0 to TAG:3 and the mid-points of their edges TAG:e0 to TAG:e3. Of tags without the small squares at
+    their corners, described by --board, the mid-points of the edges are measured.
 
     Of a grid of circles, the images of the circles' centres are measured, which are not the centres of the
     ellipses. Some circles may be hidden, but the board's ends must be seen. --points does not matter there.

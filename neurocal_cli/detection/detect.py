@@ -140,6 +140,11 @@ def detect_points(
         image, gamma = negative(image if gamma is None else linearised(image, gamma)), None
     identified = _identified(image, board, grids)
     located = identified.located
+    if points == "vertices" and any(one.grid.paired for one in located):
+        raise NoBoardError(
+            "the tags have no squares at their corners, so these are no vertices; leave out --points, to "
+            "measure the mid-points of their edges"
+        )
     measured = tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
     count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
     if count < _FEWEST:

@@ -34,6 +34,8 @@ class Grid:
     dark: int  # 0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where c + r + dark is even
     # Places of the lines -1 to cols and -1 to rows [any unit], if they are not at equal distances
     lines: tuple[Array, Array] | None = None
+    # Whether only edges from line 2 k to 2 k + 1 are there, as on tags without squares at their corners.
+    paired: bool = False
 
     @property
     def seen(self) -> NDArray[np.bool_]:

@@ -91,6 +91,8 @@ def measure(
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
     uneven = fitted.map.excess > _AGREES
+    if grid.paired:  # there is nothing along the edges, and no rim
+        return _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices).only(fitted.good)
     inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices, uneven)
     if points == "midpoints":
         along = positions_along_edges(grid_image, fitted)

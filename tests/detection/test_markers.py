@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from support.marked import errors_of, marked_scene, plane_of, taken
+from support.marked import errors_of, marked_scene, plane_of, taken, truth_of
 from support.picture_bound import scene_bound
 from support.real_data import RealFiles
+from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
@@ -19,7 +22,9 @@ from neurocal_cli.detection.markers.lattice import place
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.observations.marked_cells import Print, marked_cells
+from neurocal_cli.observations.board_kinds import TagPlane
+from neurocal_cli.observations.marked_cells import Print, marked_cells, printed_rectangles
+from neurocal_cli.observations.measured_directions import variance_across
 from neurocal_cli.simulation.rendering import Illumination, Scene
 
 CHARUCO = "charuco:6x5:40:30:DICT_4X4_50"
@@ -215,6 +220,49 @@ def test_only_borders_of_one_colour_are_borders() -> None:
     # A tag is as dark as its border.
     assert Ink(ink.cell, lines, light, -np.ones(2)).gap == pytest.approx(0.1)
     assert Ink(ink.cell[:1], lines, light[:1], -np.ones(1)).gap == pytest.approx(0.1 + 2 * 0.16)
+
+
+def tags_alone(plane: Plane) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """What is printed on a board of tags, without the squares at their corners."""
+    assert isinstance(plane, TagPlane)
+    x, y, dark = printed_rectangles(plane)
+    places = (np.concatenate([one[:1] - 1, 0.5 * (one[1:] + one[:-1]), one[-1:] + 1]) for one in (x, y))
+    across, down = (one % (1 + plane.spacing) > 1 for one in places)
+    return x, y, dark & ~(down[:, None] & across)
+
+
+@pytest.mark.parametrize("condition", slow_but(({},), ({}, {"psf": 1.6}, {"tilt": 60.0}, {"noise": 8.0})))
+def test_tags_without_squares_have_the_mid_points_of_their_edges(
+    condition: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neurocal_cli.simulation.rendering.patterns.printed_rectangles", tags_alone)
+    scene = marked_scene(plane_of("aprilgrid:3x2:40:0.25"), 6, square=56, **condition)
+    picture = taken(scene, 6)
+    found = detect_points(picture.image, scene.board)
+    places, visible = truth_of(picture)
+    assert set(found.ids) == {name for name in visible if ":e" in name}
+    across = found.across
+    assert across is not None
+    assert np.hypot(*across.T) == pytest.approx(1, abs=1e-5)
+    assert "no squares at the corners of the tags" in found.notes[0]
+    error = ((found.pixels - np.array([places[name] for name in found.ids])) * across).sum(axis=1)
+    squared = error**2 / variance_across(found.covariance, across)
+    assert np.abs(error).max() < (0.05 if condition else 0.015)
+    assert 0.5 < squared.mean() < 1.6
+    with pytest.raises(NoBoardError, match="no squares at their corners"):
+        detect_points(picture.image, scene.board, "vertices")
+    (plane,) = scene.board.planes
+    assert isinstance(plane, TagPlane)
+    with pytest.raises(NoBoardError, match="the tags have a border of two cells; say border: 2"):
+        detect_points(picture.image, Board((replace(plane, border=1),)))
+
+
+def test_markers_without_a_chessboard_around_them_are_named() -> None:
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    image = cv2.aruco.GridBoard((6, 4), 30.0, 8.0, family).generateImage((1000, 750), marginSize=60)
+    board = Board((plane_of("charuco:12x4:38:30:DICT_5X5_100"),))
+    with pytest.raises(NoBoardError, match="markers of the board are read, but the squares of a chessboard"):
+        detect_points(cv2.GaussianBlur(image, (0, 0), 0.7), board)
 
 
 @pytest.mark.slow

@@ -66,7 +66,8 @@ class GridEdges:
     vertical: NDArray[np.bool_]
     centre: Array  # (E, 2) [squares]
     light: Array  # (E,) +1 if the light side is that of growing r (growing c for vertical edges), else -1
-    known: NDArray[np.bool_]  # (E, 2) whether the vertices at both ends are known
+    # (E, 2) whether the vertices at both ends are known, where other lines cross the edge.
+    known: NDArray[np.bool_]
 
     @classmethod
     def of(cls, grid: Grid, known_ends: int) -> GridEdges:
@@ -80,6 +81,8 @@ class GridEdges:
             np.stack([seen[:-1, 1:-1], seen[1:, 1:-1]], axis=-1),
         )
         wanted = [known.sum(axis=2) == known_ends for known in ends]
+        if grid.paired:
+            wanted[0][:, ::2] = wanted[1][::2] = False
         along_c, along_r = (
             np.argwhere(which)[:, ::-1] - first for which, first in zip(wanted, ([1, 0], [0, 1]), strict=True)
         )
@@ -88,7 +91,7 @@ class GridEdges:
         centre = index + np.where(vertical[:, None], [0.0, 0.5], [0.5, 0.0])
         light = np.where((index.sum(axis=1) + grid.dark) % 2 == 1, 1.0, -1.0)
         known = np.concatenate([both[which] for both, which in zip(ends, wanted, strict=True)])
-        return cls(index.astype(np.int64), vertical, centre, light, known)
+        return cls(index.astype(np.int64), vertical, centre, light, known & (not grid.paired))
 
     def lines(self, at: SmoothMap) -> Lines:
         """Map the edges to the image."""

@@ -333,7 +333,8 @@ def _fine_fit(
     if isinstance(first.map.map, WideMap):
         # A fit that failed in the dark rim of the image starts at the map again.
         offset = np.where(first.good, offset, shift)
-    fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
+    crossed = grid_image.edges.known
+    fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise, crossed)
     usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The error of the profile, estimated from a part of the pixels, now dominates: estimate it again.
@@ -351,7 +352,7 @@ def _fitted(
     shading: Shading,
     shape: ProfileShape,
     noise: PixelNoise,
-    crossed: NDArray[np.bool_] | None = None,
+    crossed: NDArray[np.bool_],
 ) -> BatchFit:
     """Fit edges to all their pixels from initial offsets (E,), with the common parameters of the board."""
     sigma, spread = blur

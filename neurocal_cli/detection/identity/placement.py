@@ -160,7 +160,7 @@ def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) ->
     if doubtful and len(board.planes) == 1 and _fits(shape, board.planes[0]):
         return NoBoardError(
             f"detected {_size(shape)} inner vertices with ends on all sides, but the board has {wanted}; "
-            "give the size of the board in the image, or light the whole board evenly",
+            "give the size of the board in the image, or show the whole board, evenly lit",
             shape,
         )
     have = "board has" if len(board.planes) == 1 else "planes of the board have"

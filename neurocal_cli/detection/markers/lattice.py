@@ -182,6 +182,16 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     return Grid(np.ascontiguousarray(part), dark), first
 
 
+def corners_of_tags(plane: TagPlane, placed: Placed) -> tuple[Grid, tuple[int, int]]:
+    """The corners of tags as they were read, as `find_vertices` gives those with squares at them."""
+    found = np.full((plane.rows, plane.cols, 2), np.nan)
+    c, r = np.moveaxis(np.rint(placed.cells.corners[placed.at]).astype(np.int64), 2, 0)
+    found[r, c] = placed.marks.corners
+    low, high = (c.min(), r.min()), (c.max() + 1, r.max() + 1)
+    part = found[low[1] : high[1], low[0] : high[0]][::-1]
+    return Grid(np.ascontiguousarray(part), 0, paired=True), (int(low[0]), int(low[1]))
+
+
 def _leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: Flattening) -> None:
     """Remove found vertices that are not where those around them predict, in place."""
     while (seen := np.isfinite(contrast)).sum() > _FEWEST_AROUND:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.saddles import grey_levels
+from neurocal_cli.detection.finding.saddles import Image, grey_levels
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.identify import Identified, Located
 from neurocal_cli.detection.identity.placement import NoBoardError, Placement
 from neurocal_cli.detection.markers.ink import Ink
-from neurocal_cli.detection.markers.lattice import Placed, find_vertices, place
+from neurocal_cli.detection.markers.lattice import Placed, corners_of_tags, find_vertices, place
 from neurocal_cli.detection.markers.reading import USUAL, eight_bits, read_markers
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
@@ -20,6 +22,7 @@ from neurocal_cli.observations.markers import DICTIONARIES, code_count
 
 _ENOUGH = 4  # markers that agree, after which no other dictionary is tried
 _MOST = 0.5  # share of the markers after which no other scale is tried
+_WITH_SQUARES = 0.5  # share of the corners of tags that are vertices if there are squares at them
 _STRANGE = 8  # markers of another dictionary that are worth a word
 # Share of the board's markers that agree with each other, below which so many of them contradict the
 # description.
@@ -34,12 +37,14 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
     """
     grey, light = eight_bits(image), grey_levels(image)
     located, notes = [], []
+    read = 0
     for index, plane in enumerate(board.planes):
         if plane.markers is None:
             raise InputError("a board has markers on all its planes, or on none; describe them in two files")
         placed = _placed(plane, grey)
-        found = None if placed is None else find_vertices(plane, placed, light)
+        found = None if placed is None else _vertices(plane, placed, light)
         if placed is None or found is None:
+            read = max(read, 0 if placed is None else len(placed.at))
             continue
         if placed.share < _LEAST_SHARE and len(placed.at) >= _CONTRADICTING * placed.share:
             raise NoBoardError(
@@ -52,10 +57,17 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
                 "legacy: true or false in a board file"
             )
         located.append(_located(plane, index, placed, *found))
-        notes.append(_told(plane, placed))
+        notes.append(_told(plane, placed, found[0]))
     if not located:
-        raise NoBoardError(_reason(board, grey))
+        raise NoBoardError(_reason(board, grey, read))
     return Identified(tuple(located), notes=tuple(dict.fromkeys(note for note in notes if note)))
+
+
+def _vertices(plane: Plane, placed: Placed, light: Image) -> tuple[Grid, tuple[int, int]] | None:
+    """The vertices around the markers of a plane, or the corners of tags without squares at these."""
+    found = find_vertices(plane, placed, light)
+    few = found is None or found[0].seen.sum() < _WITH_SQUARES * 4 * len(placed.at)
+    return corners_of_tags(plane, placed) if isinstance(plane, TagPlane) and few else found
 
 
 def _placed(plane: Plane, grey: NDArray[np.uint8]) -> Placed | None:
@@ -102,11 +114,11 @@ def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[
         plane.spread(np.stack([one if axis == k else 0 * one for k in (0, 1)], axis=-1))[:, axis]
         for axis, one in enumerate(counts)
     )
-    whole = Grid(grid.pixels, grid.dark, (x - x[0], y[0] - y))
+    whole = replace(grid, lines=(x - x[0], y[0] - y))
     return Located(whole, plane, Placement(index, _MIRRORED, (first[0], first[1] + rows - 1)), ink)
 
 
-def _told(plane: Plane, placed: Placed) -> str:
+def _told(plane: Plane, placed: Placed, grid: Grid) -> str:
     """What the image told of the markers beyond the board's description; its text suits all images."""
     markers = plane.markers
     assert markers is not None
@@ -115,6 +127,8 @@ def _told(plane: Plane, placed: Placed) -> str:
         words.append(f"the markers are of {smallest(placed.marks.dictionary, placed.cells)}")
     if markers.legacy is None and placed.how.legacy:
         words.append("the board has the legacy pattern, whose first square is light")
+    if grid.paired:
+        words.append("there are no squares at the corners of the tags, so only their edges are measured")
     return "; ".join(words)
 
 
@@ -129,8 +143,20 @@ def smallest(dictionary: str, cells: Cells) -> str:
     )
 
 
-def _reason(board: Board, grey: NDArray[np.uint8]) -> str:
-    """Why no plane was located."""
+def _reason(board: Board, grey: NDArray[np.uint8], read: int) -> str:
+    """Why no plane was located, although so many markers of one were read."""
+    if read >= _ENOUGH:
+        return (
+            f"{read} markers of the board are read, but the squares of a chessboard around them are not "
+            "seen; show it sharper or nearer, or use a board that has them"
+        )
+    tags = next((plane for plane in board.planes if isinstance(plane, TagPlane)), None)
+    if tags is not None and tags.markers is not None:
+        family, first, other = tags.markers.dictionary, tags.markers.first_id, 3 - tags.border
+        marks = next(read_markers(grey, family, first, tags.tags[0] * tags.tags[1], other), None)
+        if marks is not None and len(np.unique(marks.number)) >= _ENOUGH:
+            cells = "a border of one cell" if other == 1 else "a border of two cells"
+            return f"the tags have {cells}; say border: {other} in a board file"
     named = {plane.markers.dictionary for plane in board.planes if plane.markers is not None} - {""}
     for dictionary in USUAL if named else ():
         if any(dictionary.rpartition("_")[0] == one.rpartition("_")[0] for one in named):

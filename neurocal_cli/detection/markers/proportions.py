@@ -58,8 +58,8 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
         )
         if not np.isfinite(spacing):
             raise NoBoardError(
-                "the images show tags without dark squares at their corners, or too blurred; use an "
-                "AprilGrid with them, as Kalibr's, or a ChArUco board"
+                "the images show tags without dark squares at their corners, or too blurred, so that their "
+                "spacing is not told; describe the board by --board, for example aprilgrid:6x6:88:0.3"
             )
         border = _border(plane, [picture for _, picture in tags])
         return replace(plane, spacing=simple(spacing, _CLOSE_SPACING), border=border)
