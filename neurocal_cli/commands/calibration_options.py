@@ -60,20 +60,23 @@ class Estimation:
             raise UsageError("--type 4 needs the known poses; give --extrinsics CAMERA.yaml")
         if self.no_skew and self.skew != "free":
             raise UsageError(f"--no-skew is --skew fixed, but --skew is {self.skew}; give one of them")
-        if self.skew == "auto" and self.method != "neuro":
+        given = {
+            "--skew auto": self.skew == "auto", "--skew": self.skew != "free", "--no-skew": self.no_skew,
+            "--fix": bool(self.fix), "--square-pixels": self.square_pixels,
+        }  # fmt: skip
+        for option in (option for option, is_given in given.items() if is_given):
+            if self.type == "3" and option != "--skew auto":
+                raise UsageError(f"--type 3 does not change the given camera; leave out {option}")
+            if self.method != "neuro" and option not in ("--skew", "--no-skew"):
+                raise UsageError(
+                    f"{option} needs --method neuro, but the method is {self.method}; leave it out"
+                )
+        if self.square_pixels and self.skew == "auto":
+            raise UsageError("--square-pixels is --skew fixed, but --skew is auto; give one of them")
+        if self.square_pixels and self.distortion == "plumb-line":
             raise UsageError(
-                f"--skew auto needs --method neuro, but the method is {self.method}; leave it out"
+                "--square-pixels does not go with --distortion plumb-line; name k1k2p1p2 instead"
             )
-        if self.type == "3" and self.skew != "free":
-            raise UsageError("--type 3 does not change the given camera; leave out --skew")
-        if self.type == "3" and self.no_skew:
-            raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
-        if self.fix and self.method != "neuro":
-            raise UsageError(f"--fix needs --method neuro, but the method is {self.method}; leave it out")
-        if self.type == "3" and self.fix:
-            raise UsageError("--type 3 does not change the given camera; leave out --fix")
-        if self.square_pixels:
-            self._check_square()
         self._fixed()
         if self.trainer != "lm" and self.method != "neuro":
             raise UsageError(
@@ -85,21 +88,6 @@ class Estimation:
             options.note_unused(f"with --method {self.method}", *unused)
         for name in _BACKPROP:
             self._require(name, "trainer", "backprop")
-
-    def _check_square(self) -> None:
-        """Refuse options that do not go with ``--square-pixels``."""
-        if self.type == "3":
-            raise UsageError("--type 3 does not change the given camera; leave out --square-pixels")
-        if self.method != "neuro":
-            raise UsageError(
-                f"--square-pixels needs --method neuro, but the method is {self.method}; leave it out"
-            )
-        if self.skew == "auto":
-            raise UsageError("--square-pixels is --skew fixed, but --skew is auto; give one of them")
-        if self.distortion == "plumb-line":
-            raise UsageError(
-                "--square-pixels does not go with --distortion plumb-line; name k1k2p1p2 instead"
-            )
 
     def _fixed(self) -> dict[str, float]:
         """The values of ``--fix`` by name; theta in degrees."""
