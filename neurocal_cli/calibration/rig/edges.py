@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.reprojection import squared_errors
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
 from neurocal_cli.calibration.rig.consensus import (
-    AGREED,
     LEAST_AGREED,
     OPPOSITE,
     PAIR_ANEW,
@@ -32,7 +31,7 @@ from neurocal_cli.calibration.rig.odd_pairs import MEDIAN, SUSPECT, odd_pairs, r
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import median, nearest_rotation
+from neurocal_cli.camera.geometry import median
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 
@@ -146,14 +145,6 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
                 f"the images of camera {alone} are shifted by one: they fit those of camera {other} of the "
                 f"{word if a in part else OPPOSITE[word]} frame; {PAIR_ANEW}"
             )
-        larger = _size_of_right(edge.problem)
-        if larger is not None:
-            factor = larger if b in part else 1 / larger
-            return (
-                f"the target of camera {alone} is {factor:.3g} times as large as its X,Y,Z say, compared "
-                "with that "
-                f"of camera {other}; check the unit of X,Y,Z and the size of the squares in its points"
-            )
     worst = outer[0]
     other = names[worst.cameras[worst.cameras[0] in part]]
     faults = {pair_name(p): why for p, why in zip(worst.problem.pairs, worst.consensus.reasons, strict=True)}
@@ -168,38 +159,6 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
         f"{other}, {told}; check that the cameras took their images at the same moment, that each file is of "
         "the camera that its name says, and that X,Y,Z and the unit are the same"
     )
-
-
-def _agree(problem: RigProblem) -> bool:
-    reasons = find_consensus(problem).reasons
-    return len(reasons) >= LEAST_AGREED and reasons.count("") > AGREED * len(reasons)
-
-
-def _size_of_right(problem: RigProblem) -> float | None:
-    """How much larger the right camera's target is than its points say, if the pairs agree with it.
-
-    The rotations of the pairs tell that of the rig. For a size s the positions of the target obey
-    s m_right = R m_left + t, which is linear in s and t.
-    """
-    left, right = problem.cameras
-    scale = problem.scale[problem.paired][:, None]
-    R = nearest_rotation(
-        (right.R[problem.paired_right] @ left.R[problem.paired_left].swapaxes(1, 2)).sum(axis=0)
-    )
-    first, second = left.t[problem.paired_left] * scale @ R.T, right.t[problem.paired_right] * scale
-    if len(first) < LEAST_AGREED:
-        return None
-    # Without t, by differences from the means.
-    apart, there = second - second.mean(axis=0), first - first.mean(axis=0)
-    size = float((apart * there).sum() / (apart * apart).sum())
-    if not size > 0:
-        return None
-    one, other = problem.observations
-    state = problem.cameras[1]
-    enlarged = replace(
-        problem, cameras=(problem.cameras[0], replace(state, t=size * state.t)), observations=(one, other)
-    )
-    return size if _agree(enlarged) else None
 
 
 def described(faults: Mapping[str, str], n: int, kind: str) -> str:
