@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.board.bend_evidence import most_probable_precision
 from neurocal_cli.adjustment.board.find import (
     LEAST_GAIN,
     Found,
@@ -28,8 +27,6 @@ from neurocal_cli.adjustment.board.find import (
     find_target,
     gain_over_given,
 )
-from neurocal_cli.adjustment.board.information import of_views, without_points
-from neurocal_cli.adjustment.board.posterior import evidence_of_given
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.outlier_views import variance_of_views
@@ -52,8 +49,7 @@ from neurocal_cli.observations.target import Target, distinct_points
 _ROUNDS = 3
 _WORTH = 0.8  # least effective share of the views, where some repeat a pose
 _SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
-_FEWEST = 4  # fewest views for bends
-_EARLY = 0.5  # share of the required gain that the first step must predict
+_FEWEST = 3  # fewest views for bends
 # Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
 # most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
 # half 3 % worse.
@@ -245,25 +241,15 @@ def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | 
     known = None if common is None else common.target
     if not _may_bend(fit[0], known):
         return common
-    # Log evidence without and with bends, for fixed common points.
-    try:
-        search = Search([fit] if common is None else common.fits, False, known, bending=True)
-        (sight,) = search.sights()
-        info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
-        held = info.held(most_probable_precision(info, search.prior.size, roughly=True))
-        rigid, bent = evidence_of_given(info.straight()), evidence_of_given(held)
-    except np.linalg.LinAlgError:  # the points do not determine the camera
-        return common
-    if bent < rigid + _EARLY * LEAST_GAIN:
-        return common
-    only = Search([fit], False, None, bending=True, still=True).result(LEAST_GAIN)
+    # The common points and the camera take in some of the bends, with few views most of them, so all are
+    # estimated together.
+    least = -np.inf if common is None else common.evidence + LEAST_GAIN
+    only = Search([fit], False, None, bending=True, still=True).result(LEAST_GAIN, least)
     start = only if common is None else common
     if start is None:
         return None
-    both = Search(start.fits, False, start.target, bending=True).result(LEAST_GAIN)
-    best = max(filter(None, (only, both)), key=lambda found: found.evidence, default=None)
-    least = LEAST_GAIN + (rigid if common is None else common.evidence)
-    return common if best is None or best.evidence < least else best
+    both = Search(start.fits, False, start.target, bending=True).result(LEAST_GAIN, least)
+    return max(filter(None, (only, both)), key=lambda found: found.evidence, default=common)
 
 
 def _may_bend(problem: Problem, known: Target | None) -> bool:

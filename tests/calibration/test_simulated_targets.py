@@ -51,3 +51,21 @@ def test_standard_deviations_hold_and_accuracy_is_at_its_bound(kind: str) -> Non
 def test_standard_deviations_hold_where_the_lens_is_chosen_with_the_target(kind: str) -> None:
     of_all = figures([outcome(draw(kind, seed), "auto") for seed in range(48)])
     assert 0.8 < of_all.z < 1.2, of_all
+
+
+@pytest.mark.parametrize("seed", [9101, 9102])
+def test_the_bends_of_three_views_are_found_with_the_camera(seed: int) -> None:
+    points, truth = photographed("flexing", seed, 3, 0.5, sigma=0.03)
+    camera = calibrate(points)
+    assert camera.target is not None
+    assert camera.target.bends is not None
+    for name, true in (("alpha_u", truth.K[0, 0]), ("u0", truth.K[0, 2]), ("v0", truth.K[1, 2])):
+        assert abs(getattr(camera.intrinsics, name) - true) < 3 * camera.std[name], name
+
+
+def test_two_views_of_one_plane_are_poor() -> None:
+    points, _ = photographed("flat", 9, 2, 0.0, sigma=0.05)
+    verdict = calibrate(points, skew=False).verdict
+    assert verdict is not None
+    assert verdict.word == "poor"
+    assert any("needs every view" in reason for reason in verdict.reasons)

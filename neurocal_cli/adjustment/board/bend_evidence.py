@@ -29,11 +29,10 @@ _FAR = 6.0  # largest bend of a view over the rms of the other views
 _COMMON = 30.0  # largest common part over the mean square of the rest: exceeded in one random set of 200
 
 
-def most_probable_precision(info: Information, size: float, roughly: bool = False) -> float:
+def most_probable_precision(info: Information, size: float) -> float:
     """Prior precision of the bends with the highest evidence, in units of the noise precision.
 
-    `info` is around the points that all views share, and `size` that of the target [world unit]. Roughly
-    means within a factor of 3.
+    `info` is around the points that all views share, and `size` that of the target [world unit].
     """
     noise, of_precision = info.straight().cost / info.spare, evidence_by_precision(info)
 
@@ -44,7 +43,7 @@ def most_probable_precision(info: Information, size: float, roughly: bool = Fals
     values = evidence(grid)
     best = int(np.argmax(values))
     x, highest = float(grid[best]), float(values[best])
-    for width in () if roughly else _FINER:
+    for width in _FINER:
         low, high = evidence(np.array([x - width, x + width])).tolist()
         curved = low - 2 * highest + high
         step = 0.5 * (low - high) / curved * width if curved < 0 else np.sign(high - low) * width

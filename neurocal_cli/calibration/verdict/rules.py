@@ -7,7 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration.calibration import Calibration, StopReason, Verdict, spare_equations
+from neurocal_cli.calibration.calibration import (
+    Calibration,
+    StopReason,
+    Verdict,
+    free_entries,
+    spare_equations,
+)
 from neurocal_cli.calibration.verdict.causes import closest, explains
 from neurocal_cli.calibration.verdict.causes import findings as causes
 from neurocal_cli.calibration.verdict.evidence import Evidence
@@ -54,6 +60,11 @@ _SKEW, _LEAN = 0.003, 0.004
 _STRETCHED_POOR = 0.025  # stretch of one side against the other
 _SPACING = 0.004  # rms over rms; of nine boards of photographs none is off by more than 0.0017
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
+_UNCHECKED = (
+    "the camera needs every view, so it may take in errors of single views, such as a board that bends, and "
+    "its std do not include them",
+    "add views with the board tilted by 30 to 45 degrees in different directions",
+)
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
@@ -92,6 +103,8 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     given = evidence.of_given
     yield from given
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
+    if _is_unchecked(calibration, evidence):
+        yield 2, *_UNCHECKED
     # A cause explains the other errors, so it is reported first even if it hardly biases the camera.
     contest = evidence.contest
     if contest is not None and _explains(calibration, evidence):
@@ -101,6 +114,16 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
+
+
+def _is_unchecked(calibration: Calibration, e: Evidence) -> bool:
+    """Whether views of a plane cannot contradict each other, or hardly and their residuals are no noise.
+
+    Each gives two conditions on the entries of A.
+    """
+    spare = 2 * e.poses - int(free_entries(calibration)[:5].sum())
+    flat = calibration.type in (1, 2) and bool(np.isnan(e.coverage.relief))
+    return flat and spare < (2 if CORRELATED.grade(e.correlation) else 1)
 
 
 def _redundancy(calibration: Calibration) -> Iterator[Finding]:
