@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.simulated_targets import KINDS, cost_on_new_views, draw, figures, outcome
+from support.targets import photographed
 
 from neurocal_cli import calibrate
 
