@@ -20,6 +20,8 @@ _SMALL = 1e-4  # relative change for numerical derivatives, and of the step at w
 _CENTRE = 0.1  # half diagonals; prior standard deviation of the centre ...
 _SQUARE = 0.05  # squares; ... relative to this standard deviation of a vertex
 _FARTHEST = 3.0  # rad; no lens covers more
+_BENT, _CLEARLY = 1.0, 0.5  # px, rms that one homography leaves, and share of it that a wide lens may leave
+_AHEAD = 0.1  # cosine of the angle from the middle, below which nothing is flattened
 
 
 @frozen_dataclass(eq=False)
@@ -136,3 +138,44 @@ def _errors(lenses: Array, grid: Array, pixels: Array) -> tuple[Array, Array]:
     wide = focal * angle / np.maximum(sine, 1e-9)
     error = np.concatenate([(seen * along).sum(axis=-1) * focal, (seen * around).sum(axis=-1) * wide], axis=1)
     return matrix, np.where((ahead > 0).all(axis=1)[:, None], error, np.inf)
+
+
+@frozen_dataclass(eq=False)
+class Flattening:
+    """A map that flattens the image of a board, so that homographies describe it although a lens bends it.
+
+    Pixels become the points in which their rays meet the plane at right angles to the ray of the board's
+    middle. Without a lens, this is the image itself.
+    """
+
+    lens: WideLens | None = None
+    turn: Array | None = None  # (3, 3) rotation of the directions of the lens, the board's middle to the axis
+
+    @classmethod
+    def of(cls, ground: Array, pixels: Array, left: float, size: tuple[int, int]) -> Flattening:
+        """That for places (N, 2) of a board at pixels, of which one homography leaves `left` [px] rms."""
+        if left < _BENT:
+            return cls()
+        fit = fit_wide_lens(ground, pixels, size)
+        if not fit.rms < _CLEARLY * left:
+            return cls()
+        axis = fit.lens.directions(pixels.mean(axis=0))
+        aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        aside /= np.linalg.norm(aside)
+        return cls(fit.lens, np.stack([np.cross(aside, axis), aside, axis]))
+
+    def flat(self, pixels: Array) -> Array:
+        """Points (..., 2) of pixels (..., 2); NaN behind the plane."""
+        if self.lens is None or self.turn is None:
+            return pixels
+        ahead = self.lens.directions(pixels) @ self.turn.T
+        with np.errstate(invalid="ignore"):
+            depth = np.where(ahead[..., 2:] > _AHEAD, ahead[..., 2:], np.nan)
+        return np.asarray(self.lens.focal * ahead[..., :2] / depth)
+
+    def pixels(self, points: Array) -> Array:
+        """Pixels (..., 2) of points (..., 2)."""
+        if self.lens is None or self.turn is None:
+            return points
+        ahead = np.concatenate([points / self.lens.focal, np.ones_like(points[..., :1])], axis=-1)
+        return self.lens.pixels(ahead @ self.turn)

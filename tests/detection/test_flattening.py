@@ -11,8 +11,7 @@ from support.wide_boards import WideRecipe, wide_scene
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
-from neurocal_cli.detection.markers.flattening import Flattening
-from neurocal_cli.detection.wide_lens import WideLens
+from neurocal_cli.detection.wide_lens import Flattening, WideLens
 from neurocal_cli.simulation.rendering import Scene, Target
 
 GROUND = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
