@@ -178,5 +178,5 @@ def test_tags_without_squares_at_their_corners_are_named() -> None:
     for k in range(12):
         left, top = 20 + 88 * (k % 4), 20 + 88 * (2 - k // 4)
         image[top : top + 70, left : left + 70] = cv2.aruco.generateImageMarker(family, k, 70)
-    with pytest.raises(NoBoardError, match="tags without dark squares at their corners"):
+    with pytest.raises(NoBoardError, match="4x3 tags without dark squares at their corners"):
         found_board([cv2.GaussianBlur(image, (0, 0), 0.8)])

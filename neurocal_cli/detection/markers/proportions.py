@@ -57,9 +57,11 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
             [_spacing(replace(plane, spacing=one), pixels) for one, (pixels, _, _) in tags], np.nan
         )
         if not np.isfinite(spacing):
+            size = "x".join(map(str, plane.tags))
             raise NoBoardError(
-                "the images show tags without dark squares at their corners, or too blurred, so that their "
-                "spacing is not told; describe the board by --board, for example aprilgrid:6x6:88:0.3"
+                f"the images show {size} tags without dark squares at their corners, or too blurred, so that "
+                "their spacing is not told; describe the board by --board, for example "
+                f"aprilgrid:{size}:88:0.3"
             )
         border = _border(plane, [picture for _, picture in tags])
         return replace(plane, spacing=simple(spacing, _CLOSE_SPACING), border=border)
