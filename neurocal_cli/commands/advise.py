@@ -63,7 +63,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     answer(as_json, lambda: advice_json(advice), lambda: "\n".join(advice_lines(advice, known.verdict)))
     write_plot(plot, draw_advice, advice, known)
     if plot is not None:
-        suggest(calibration, "photograph these views, and calibrate from all images again")
+        suggest(calibration, "photograph these views, and calibrate from all images")
     elif not as_json:
         suggest(calibration, "neurocal advise {} --plot next.png")
 
