@@ -27,6 +27,8 @@ from neurocal_cli.camera.state import CameraState
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
 # test_adjust.py holds the minimum against SciPy's.
 OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
+NEARBY = 30
+"""Most steps to a minimum that is near: of the same camera for other data, or with other unknowns."""
 FLOOR = 1e-13  # rms in normalised pixels that rounding alone can cause
 
 # Extra equations on the shared camera, such as a prior: Jacobian (m, 5 + K) and residuals (m,).

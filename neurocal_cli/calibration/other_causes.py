@@ -18,7 +18,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.adjust import Adjusted, adjust
+from neurocal_cli.adjustment.adjust import NEARBY, Adjusted, adjust
 from neurocal_cli.adjustment.board.find import Found, counted_again, gain_over_given, views_for_target
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
@@ -52,7 +52,6 @@ _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.
 
 # Of one view.
 _HOLDS = 2.0  # times the rms error of the other views
-_STEPS = 40
 _STARTS = 20
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
 _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
@@ -275,7 +274,7 @@ def _fit(points: Correspondences, start: CameraState | None, free: tuple[int, ..
     views = arrange(points)
     moving = np.isin(np.arange(5 + start.k.shape[-1]), free)
     try:
-        adjusted = adjust(views.batches, normalised(start, views), moving, True, _STEPS)
+        adjusted = adjust(views.batches, normalised(start, views), moving, True, NEARBY)
     except (np.linalg.LinAlgError, FloatingPointError):
         return _Fitted()
     rmse = float(np.sqrt(adjusted.cost.sum() / len(points))) * views.pixel_scale

@@ -12,13 +12,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates, including
 from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS
+from neurocal_cli.calibration.verdict.words import DETERMINE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
@@ -30,8 +31,6 @@ _CURVED = 20.0  # relative error of a linearisation over the size of the cause, 
 _OF_EACH = 0.15  # the same after a cause that each view has in its own way, which may be another motion
 _FAR = 0.25  # the same after a cause that was fitted
 _PART = 0.3  # of the evidence: a good part
-_STEPS = 30
-_DETERMINE = 3  # views that determine a camera
 _MUCH = 0.3  # share of the squared error
 _LINEAR = 0.02  # of the focal length: largest difference of two cameras that is not fitted
 
@@ -218,14 +217,14 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
         free, member = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5
         groups = np.flatnonzero(member), np.flatnonzero(~member)
         each = [
-            adjust(views.subset(some).batches, state.of_views(some), free, True, _STEPS) for some in groups
+            adjust(views.subset(some).batches, state.of_views(some), free, True, NEARBY) for some in groups
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
-    of_given = one.rival.of_given and views.n_views >= _DETERMINE and not state.square
+    of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
     if (of_given or one.rival.cause == "a lens that is too simple") and one.explained > _MUCH:
         added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
-        fit = adjust(views.batches, state, free, True, _STEPS)
+        fit = adjust(views.batches, state, free, True, NEARBY)
         return _Fit(float(fit.cost.sum()), fit.state.entries[0], point_residuals(views, fit.state))
     return None
 

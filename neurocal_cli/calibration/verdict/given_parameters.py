@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.adjust import Adjusted, adjust
+from neurocal_cli.adjustment.adjust import NEARBY, Adjusted, adjust
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
@@ -25,7 +25,6 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhol
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
-_STEPS = 20  # to the minimum of the simpler camera
 _TANGENTIAL = ("p1", "p2")
 _DISPLACED = "k1k2"  # the model instead of a rich lens
 
@@ -43,7 +42,7 @@ def hidden_by_lens(
     if not tangential.any():
         return []
     start = normalised(replace(state, k=np.where(tangential[5:], 0.0, state.k)), views)
-    adjusted = adjust(views.batches, start, free & ~tangential, True, _STEPS)
+    adjusted = adjust(views.batches, start, free & ~tangential, True, NEARBY)
     lens = replace(RIVALS[0], steps=lambda lin: np.eye(lin.width)[:, np.flatnonzero(tangential)])
     held = contest(
         views, adjusted.state, free & ~tangential, True, calibration.points.image_size, worth=worth,

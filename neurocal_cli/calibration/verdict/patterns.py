@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.leave_out import Quadratics
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.calibration.verdict.linearised import Linearised
 from neurocal_cli.calibration.verdict.rival import Pattern
@@ -22,7 +23,6 @@ _NEARER = 0.1  # least relative range of distances for a change with the distanc
 _TURNED = 0.2  # rad; least range of tilts
 _BY_POSE = 6.0  # ways in which poses differ, with which errors of the lens are correlated
 _STARTS, _ROUNDS = 20, 20
-_NOTHING = 1e-300
 
 
 def common(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
@@ -71,14 +71,14 @@ def _places(lin: Linearised) -> NDArray[np.intp]:
 
 
 def _ramp(values: Array) -> Array:
-    return (values - values.mean()) / max(float(np.ptp(values)), _NOTHING)
+    return (values - values.mean()) / max(float(np.ptp(values)), NOTHING)
 
 
 def _two_groups(S: Array, g: Array, cost: Array) -> Array:
     """(P, V) candidates for the two groups of views that differ most, each of two views or more."""
     V, m = g.shape
     if m == 1:  # one of the divisions of the sorted values
-        rank = np.argsort(np.argsort(g[:, 0] / np.maximum(S[:, 0, 0], _NOTHING), kind="stable"))
+        rank = np.argsort(np.argsort(g[:, 0] / np.maximum(S[:, 0, 0], NOTHING), kind="stable"))
         return (rank >= np.arange(2, V - 1)[:, None]).astype(float)
     member = _divided(Quadratics(S, g, cost))
     if member is None or min(np.count_nonzero(member), np.count_nonzero(~member)) < 2:

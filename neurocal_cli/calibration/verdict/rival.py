@@ -14,13 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.leave_out import least_by_precision, quietly
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.verdict.findings import Limit, in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
-_NOTHING, _NO_COST, _ROUNDING = 1e-300, 1e-12, 1e-9
+_NO_COST, _ROUNDING = 1e-12, 1e-9
 _ITERATIONS = 3  # the noise is what the rival leaves
 _ABSORBED = (
     1e-7  # share of the information about an unknown, beside the poses, that is not more than rounding
@@ -194,7 +195,7 @@ class _Known:
 
     @classmethod
     def of(cls, M: Array, n: float) -> _Known:
-        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M)[:-1], _NOTHING))
+        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M)[:-1], NOTHING))
         inverse = scale[:, None] * np.linalg.inv(M[:-1, :-1] * np.outer(scale, scale)) * scale
         right = inverse @ M[:-1, -1]
         return cls(M, n, inverse, right, float(M[-1, -1] - right @ M[:-1, -1]))
@@ -223,7 +224,7 @@ class _Effect:
         values = np.where(told, values, 0.0).ravel()
         turned = np.where(told[..., None], vectors.swapaxes(1, 2) @ self.along, 0.0).reshape(V * m, -1)
         by_precision = least_by_precision(known.M, values, turned)
-        freely, _ = by_precision(np.array([_ROUNDING * values.max(initial=_NOTHING)]))
+        freely, _ = by_precision(np.array([_ROUNDING * values.max(initial=NOTHING)]))
         if not known.evidence(np.maximum(freely, _NO_COST * known.cost), np.zeros(1))[0] > least:
             return
         _, logdet = np.linalg.slogdet(known.M[:-1, :-1])
@@ -254,7 +255,7 @@ class _Effect:
             values, vectors = np.linalg.eigh(S)
             told = values > (vectors**2 * (weights**2 @ self.absorbed)[:, :, None]).sum(axis=1)
             turned = np.where(told, (vectors.swapaxes(1, 2) @ g[..., None])[..., 0], 0.0)
-            values = np.where(told, values, _NOTHING)
+            values = np.where(told, values, NOTHING)
             freely = known.cost - (turned**2 / values).sum(axis=1)
             reach = known.evidence(np.maximum(freely, _NO_COST * known.cost), 2 * np.log(choices))
             if not reach.max() > least:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
@@ -19,8 +19,8 @@ _TURNED = 0.3  # of the distance of two centres: how far their mean may be from 
 _AS_MUCH = 0.04  # of the diagonal: a displacement that counts as much as another focal length
 _STRETCHED = 0.004  # relative
 _LINEAR = 0.2  # of the focal length: changes up to this are estimated, if roughly
-_DETERMINE = 3  # views that determine a camera of their own
-_STEPS = 30
+DETERMINE = 3
+"""Views that determine a camera of their own."""
 _SOME = 0.15  # share of the largest change of a given value from which on others are told, too
 
 
@@ -87,9 +87,9 @@ def two_cameras(told: Told) -> Said:
         step = told.found.rival.steps_at(lin) @ told.found.amounts * told.found.weights[which[0]]
         step[lin.free] += told.found.camera[: len(lin.free)]  # without the unknowns of an earlier cause
         entries = lin.state.entries[0] + step[:5]
-        if len(which) >= _DETERMINE:
+        if len(which) >= DETERMINE:
             batches, state = lin.views.subset(which).batches, lin.state.of_views(which)
-            entries = adjust(batches, state, free, True, _STEPS).state.entries[0]
+            entries = adjust(batches, state, free, True, NEARBY).state.entries[0]
         cameras.append(entries[[0, 2, 3, 4]] * px + np.append([0.0, 0.0], lin.views.pixel_centre))
     order = in_sequence(lin.views.names)
     names, others = ([lin.views.names[k] for k in order if member[k] == some] for some in (True, False))
@@ -239,7 +239,7 @@ def wrongly_given(told: Told) -> Said:
     if lin.state.square and len(places) == 1:
         amount = float(amounts[0])
         return f"the pixels are not square: alpha_v - alpha_u is {100 * amount:+.2g} % of alpha_u", largest
-    if lin.views.n_views < _DETERMINE and len(places) > 2:
+    if lin.views.n_views < DETERMINE and len(places) > 2:
         text = "the given camera does not fit these points: another focal length or centre does"
         return text + _poses(told), largest
     names: Mapping[int, str] = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
