@@ -50,15 +50,22 @@ def array(*shape: int) -> Kind:
     return inline(lambda field: field.array(*shape), lambda value: flow(np.asarray(value)))
 
 
-def _rows_of_texts(count: int) -> Kind:
-    def read(field: Field) -> list[tuple[str, ...]]:
-        found = [tuple(entry.texts()) for entry in field.items()]
-        for entry, names in zip(field.items(), found, strict=True):
+def _rows_of_texts(count: int = 0) -> Kind:
+    def read(field: Field) -> tuple[tuple[str, ...], ...]:
+        found = tuple(tuple(entry.texts()) for entry in field.items())
+        for entry, names in zip(field.items() if count else (), found, strict=bool(count)):
             if len(names) != count:
                 entry.fail(f"a list of {count} texts")
         return found
 
     return Kind(read, lambda key, values, _: list_lines(key, map(quoted_words, values)))
+
+
+_TRIPLES = _rows_of_texts(3)
+
+
+def _estimate(field: Field) -> tuple[float, float]:
+    return field["value"].number(), field["std"].number_or_nan()
 
 
 _KINDS = {
@@ -82,8 +89,16 @@ _KINDS = {
     "lines": Kind(
         lambda field: tuple(field.texts()), lambda key, values, _: list_lines(key, map(quoted, values))
     ),
+    "rows of texts": _rows_of_texts(),
     "pairs of texts": _rows_of_texts(2),
-    "triples of texts": _rows_of_texts(3),
+    "reasons": Kind(  # why pairs of names were left out
+        lambda field: {row[:2]: row[2] for row in _TRIPLES.read(field)},
+        lambda key, values, long: _TRIPLES.lines(key, [(*pair, why) for pair, why in values.items()], long),
+    ),
+    "estimate": inline(  # a value and its standard deviation
+        _estimate, lambda pair: mapping(value=number(pair[0]), std=number(pair[1]))
+    ),
+    "square": inline(lambda field: field, flow),  # read as it is, for a size that is known later
 }
 
 
@@ -114,7 +129,10 @@ class Keys:
     def lines(self, value: Any, long: bool = False) -> Iterator[str]:
         """Lines of the block."""
         for name, attribute, optional, kind in self.keys:
-            own = self.computed[name](value) if name in self.computed else getattr(value, attribute)
+            if name in self.computed:
+                own = self.computed[name](value)
+            else:
+                own = value[attribute] if isinstance(value, dict) else getattr(value, attribute)
             if not (optional and (own is kind.empty or own == kind.empty)):
                 yield from kind.lines(name, own, long)
 
@@ -135,6 +153,18 @@ def _kind(word: str, kinds: Mapping[str, Kind]) -> Kind:
     if re.fullmatch(r"[n\d](?:x[n\d]+)*", word):
         return array(*(-1 if size == "n" else int(size) for size in word.split("x")))
     return kinds[word] if word in kinds else _KINDS[word]
+
+
+def named(word: str | Kind, empty: Any = None) -> Kind:
+    """Values of a kind by their names."""
+    kind = _KINDS[word] if isinstance(word, str) else word
+    return Kind(
+        lambda field: {name: kind.read(entry) for name, entry in field.entries().items()},
+        lambda key, values, long: block(
+            key, [line for name in values for line in kind.lines(plain_text(name), values[name], long)]
+        ),
+        empty,
+    )
 
 
 def record(make: Callable[..., Any], keys: Keys, inline: bool = False) -> Kind:

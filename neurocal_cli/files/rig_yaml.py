@@ -11,36 +11,37 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import VERDICT, verdict_lines
+from neurocal_cli.files.calibration_blocks import VERDICT
 from neurocal_cli.files.calibration_tree import calibration_from_field
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.files.file_storage import read_tree
-from neurocal_cli.files.key_tables import Keys
+from neurocal_cli.files.key_tables import Keys, inline, named, record
 from neurocal_cli.files.stereo_yaml import RESULT, stereo_from_field, stereo_lines
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import (
-    block,
-    boolean,
-    flow,
-    list_lines,
-    mapping,
-    number,
-    quoted,
-    quoted_words,
-    text,
-)
+from neurocal_cli.files.yaml_text import block, boolean, list_lines, text
 
 FORMAT = 1  # of the block rig; to be raised if older readers cannot read a change
-_STDS = (*POSE_NAMES, "baseline")
-_LEFT_OUT = Keys(
-    "left_out: triples of texts",
-    left_out=lambda rig: [(*view, why) for view, why in rig.left_out.items()],
+_STD = record(dict, Keys(", ".join(f"{name}: measure" for name in (*POSE_NAMES, "baseline"))), inline=True)
+_POSES = named(record(dict, Keys("R: 3x3, t: 3, std: std", {"std": _STD}), inline=True))
+_EDGE = Keys("cameras: sentences, views: integer, baseline: number, baseline_std: measure")
+_RIG = Keys(
+    "unit: text, covariance: square, frames: rows of texts, left_out: reasons, delays?: delays,"
+    f"timed?: timed, {RESULT}, warnings: lines, verdict=judgement?: verdict",
+    {
+        "delays": named("estimate", empty={}),
+        "timed": inline(Field.boolean, boolean),
+        "verdict": VERDICT,
+    },
+    frames=lambda rig: [[word for pair in views.items() for word in pair] for views in rig.frames.values()],
+    timed=lambda rig: rig.timed if rig.delays else None,
+    verdict=lambda rig: rig.verdict,
 )
 
 
@@ -51,55 +52,26 @@ def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> s
     if len(cameras) == 2:
         lines = stereo_lines(rig.pair(*cameras), alpha, by_rows)
         cameras = {name: camera.lean for name, camera in cameras.items()}
-    named = ("\n".join(block(quoted_key(name), calibration_lines(camera, by_rows=by_rows)))
+    parts = ("\n".join(block(text(name), calibration_lines(camera, by_rows=by_rows)))
              for name, camera in cameras.items())  # fmt: skip
     lines = chain(
         lines,
-        block("cameras", (line for part in named for line in part.split("\n"))),
-        block("poses", (line for name in rig.poses for line in _pose_lines(rig, name))),
-        list_lines("edges", (_edge(rig, a, b, count) for (a, b), count in rig.edges.items())),
-        block("rig", _rig_lines(rig)),
+        block("cameras", (line for part in parts for line in part.split("\n"))),
+        _POSES.lines("poses", {name: _pose(rig, name) for name in rig.poses}, False),
+        list_lines("edges", (_EDGE.flow(_edge(rig, *pair)) for pair in rig.edges)),
+        block("rig", [f"format: {FORMAT}", *_RIG.lines(rig)]),
     )
     return "\n".join([*HEADER, *lines, ""])
 
 
-def quoted_key(name: str) -> str:
-    """A name as the key of a mapping."""
-    return text(name)
+def _pose(rig: Rig, name: str) -> dict[str, Any]:
+    return {"R": rig.poses[name].R, "t": rig.poses[name].t, "std": rig.std[name]}
 
 
-def _pose_lines(rig: Rig, name: str) -> Iterator[str]:
-    pose, std = rig.poses[name], rig.std[name]
-    stds = mapping(**{key: number(std[key]) for key in _STDS})
-    yield f"{quoted_key(name)}: {{R: {flow(pose.R)}, t: {flow(pose.t)}, std: {stds}}}"
-
-
-def _edge(rig: Rig, first: str, second: str, count: int) -> str:
+def _edge(rig: Rig, first: str, second: str) -> dict[str, Any]:
     pair = rig.pair(first, second)
-    return mapping(
-        cameras=quoted_words((first, second)),
-        views=str(count),
-        baseline=number(pair.baseline),
-        baseline_std=number(pair.std["baseline"]),
-    )
-
-
-def _rig_lines(rig: Rig) -> Iterator[str]:
-    yield f"format: {FORMAT}"
-    yield f"unit: {text(rig.unit)}"
-    yield f"covariance: {flow(rig.covariance)}"
-    frames = (quoted_words(word for pair in views.items() for word in pair) for views in rig.frames.values())
-    yield from list_lines("frames", frames)
-    yield from _LEFT_OUT.lines(rig)
-    if rig.delays:
-        delays = {
-            name: mapping(value=number(value), std=number(std)) for name, (value, std) in rig.delays.items()
-        }
-        yield from block("delays", (f"{quoted_key(name)}: {entry}" for name, entry in delays.items()))
-        yield f"timed: {boolean(rig.timed)}"
-    yield from RESULT.lines(rig)
-    yield from list_lines("warnings", map(quoted, rig.warnings))
-    yield from verdict_lines(rig.verdict)
+    std, count = pair.std["baseline"], rig.edges[first, second]
+    return {"cameras": (first, second), "views": count, "baseline": pair.baseline, "baseline_std": std}
 
 
 def has_cameras(path: str | Path) -> bool:
@@ -140,36 +112,24 @@ def rig_from_field(root: Field) -> Rig:
         root.refuse(
             f"the cameras and rig have different units ({', '.join(sorted(units))}); correct those edited"
         )
-    poses, stds = {}, {}
-    for name, entry in root["poses"].entries().items():
+    poses, found = {}, _POSES.read(root["poses"])
+    for name, entry in found.items():
         try:
-            poses[name] = Pose(entry["R"].array(3, 3), entry["t"].array(3))
+            poses[name] = Pose(entry["R"], entry["t"])
         except InputError as error:
             raise FormatError(f"poses.{name}: {error}; correct it", root.source) from error
-        stds[name] = {key: entry["std"][key].number_or_nan() for key in _STDS}
     if list(poses) != list(cameras):
         root["poses"].fail(f"the poses of {', '.join(cameras)}, in this order")
     if not np.allclose(next(iter(poses.values())).D, np.eye(3, 4), atol=1e-9):
         root["poses"].fail("poses relative to the first camera, whose own pose is R = 1, t = 0")
-    frames = {}
-    for entry in own["frames"].items():
-        words = entry.texts()
+    rest, frames = _RIG.read(own), {}
+    for entry, words in zip(own["frames"].items(), rest.pop("frames"), strict=True):
         views = dict(zip(words[::2], words[1::2], strict=False))
         if len(words) < 4 or len(words) % 2 or not set(views) <= set(cameras):
             entry.fail("a list of cameras of this rig and their views, one after the other")
         frames[words[1]] = views
-    delays = own["delays"].entries() if "delays" in own else {}
     n = 6 * (len(cameras) - 1)
-    return Rig(
-        cameras,
-        poses,
-        stds,
-        own["covariance"].array(n, n, unknown=True),
-        frames,
-        {(camera, view): why for camera, view, why in _LEFT_OUT.read(own)["left_out"]},
-        {name: (one["value"].number(), one["std"].number_or_nan()) for name, one in delays.items()},
-        own["timed"].boolean() if "timed" in own else False,
-        **RESULT.read(own),
-        warnings=tuple(own["warnings"].texts()),
-        judgement=own.read("verdict", VERDICT.read),
-    )
+    stds = {name: entry["std"] for name, entry in found.items()}
+    covariance, timed = rest.pop("covariance").array(n, n, unknown=True), bool(rest.pop("timed"))
+    del rest["unit"]
+    return Rig(cameras, poses, stds, covariance, frames, timed=timed, **rest)

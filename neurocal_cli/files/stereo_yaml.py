@@ -18,30 +18,41 @@ from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import POSE_GROUPS, VERDICT, verdict_lines
+from neurocal_cli.files.calibration_blocks import POSE_GROUPS, VERDICT
 from neurocal_cli.files.calibration_tree import calibration_from_field
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.files.exchange.camera_set import METRES
 from neurocal_cli.files.file_storage import read_tree
-from neurocal_cli.files.key_tables import Keys
+from neurocal_cli.files.key_tables import Keys, record
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import block, boolean, flow, mapping, number, text, words
+from neurocal_cli.files.yaml_text import block
 
 FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
 # E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
 _SAME = 1e-6
 
-_MATRICES = Keys(
-    "R: 3x3, t: 3, E: 3x3, F: 3x3, baseline: number, baseline_std: measure",
+RESULT = "rmse_px: measure, max_px: measure, converged: boolean, stop_reason: text, iterations: integer"
+"""Keys of every rig."""
+_GROUPS = {group: Keys(", ".join(f"{n}: estimate" for n in names)) for group, names in POSE_GROUPS}
+_POSE = Keys(
+    "unit: text, R: 3x3, t: 3, E: 3x3, F: 3x3, baseline: number, baseline_std: measure, rotation: rotation,"
+    f"translation: translation, covariance: covariance, {RESULT}, delay?: delay",
+    {
+        **{group: record(dict, keys, inline=True) for group, keys in _GROUPS.items()},
+        "covariance": record(dict, Keys("names: names, data: square"), inline=True),
+        "delay": record(dict, Keys("value: number, std: measure, timed: boolean"), inline=True),
+    },
     baseline_std=lambda rig: rig.std["baseline"],
-)
-RESULT = Keys(  # of every rig
-    "rmse_px: measure, max_px: measure, converged: boolean, stop_reason: text, iterations: integer"
+    rotation=lambda rig: dict(_estimates(rig)[:3]),
+    translation=lambda rig: dict(_estimates(rig)[3:]),
+    covariance=lambda rig: {"names": POSE_NAMES, "data": rig.covariance},
+    delay=lambda rig: rig.delay and dict(zip(("value", "std"), rig.delay, strict=True), timed=rig.timed),
 )
 _RECTIFICATION = Keys("R1: nxn, R2: nxn, P1: nxn, P2: nxn, Q: nxn")
 _REST = Keys(
-    "pairs: pairs of texts, left_out: triples of texts, warnings: lines",
-    left_out=lambda rig: [(*pair, why) for pair, why in rig.left_out.items()],
+    "pairs: pairs of texts, left_out: reasons, warnings: lines, verdict=judgement?: verdict",
+    {"verdict": VERDICT},
+    verdict=lambda rig: rig.verdict,
 )
 
 
@@ -79,21 +90,15 @@ def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, st
 
 def _stereo_lines(rig: StereoRig, rectified: Rectification | None) -> Iterator[str]:
     yield f"format: {FORMAT}"
-    yield f"unit: {text(rig.unit)}"
-    yield from _MATRICES.lines(rig)
-    values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
-    for group, members in POSE_GROUPS:
-        entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
-        yield f"{group}: {mapping(**entries)}"
-    yield f"covariance: {mapping(names=words(POSE_NAMES), data=flow(rig.covariance))}"
-    yield from RESULT.lines(rig)
-    if rig.delay is not None:
-        value, std = rig.delay
-        yield f"delay: {mapping(value=number(value), std=number(std), timed=boolean(rig.timed))}"
+    yield from _POSE.lines(rig)
     if rectified is not None:
         yield from block("rectification", _RECTIFICATION.lines(rectified))
     yield from _REST.lines(rig)
-    yield from verdict_lines(rig.verdict)
+
+
+def _estimates(rig: StereoRig) -> list[tuple[str, tuple[float, float]]]:
+    values = zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True)
+    return [(name, (value, rig.std[name])) for name, value in values]
 
 
 def read_stereo_rig(path: str | Path) -> StereoRig:
@@ -128,36 +133,26 @@ def stereo_from_field(root: Field) -> StereoRig:
         pose = Pose(block["R"].array(3, 3), block["t"].array(3))
     except InputError as error:
         raise FormatError(f"stereo: {error}; correct it", root.source) from error
-    std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
-    matrices, rest = _MATRICES.read(block), _REST.read(block)
+    found = _POSE.read(block)
+    stated = {**found["rotation"], **found["translation"]}
+    delay = found["delay"] or {"timed": False}
     rig = StereoRig(
         left,
         right,
         pose,
-        std | {"baseline": matrices["baseline_std"]},
-        block["covariance"]["data"].array(6, 6, unknown=True),
-        tuple(rest["pairs"]),
-        {(a, b): why for a, b, why in rest["left_out"]},
-        *_delay(block),
-        warnings=rest["warnings"],
-        **RESULT.read(block),
-        judgement=block.read("verdict", VERDICT.read),
+        {name: std for name, (_, std) in stated.items()} | {"baseline": found["baseline_std"]},
+        found["covariance"]["data"].array(6, 6, unknown=True),
+        delay=(delay["value"], delay["std"]) if "value" in delay else None,
+        timed=delay["timed"],
+        **_REST.read(block),
+        **{key: found[key] for key in ("rmse_px", "max_px", "converged", "stop_reason", "iterations")},
     )
-    _check_consistent(rig, block, matrices)
+    _check_consistent(rig, block, found, [value for value, _ in stated.values()])
     return rig
 
 
-def _delay(block: Field) -> tuple[tuple[float, float] | None, bool]:
-    """The delay of the right camera's images with its std, if there is one, and whether times were stated."""
-    if "delay" not in block:
-        return None, False
-    own = block["delay"]
-    return (own["value"].number(), own["std"].number_or_nan()), own["timed"].boolean()
-
-
-def _check_consistent(rig: StereoRig, block: Field, matrices: Mapping[str, Any]) -> None:
+def _check_consistent(rig: StereoRig, block: Field, matrices: Mapping[str, Any], values: list[float]) -> None:
     """Refuse a file with contradicting values, of which one was edited."""
-    values = [block[g][n]["value"].number() for g, names in POSE_GROUPS for n in names]
     stated = (
         ("E", matrices["E"], rig.E),
         ("F", matrices["F"], rig.F),
