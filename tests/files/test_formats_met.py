@@ -866,3 +866,67 @@ def test_opencv_s_packed_files_are_read(ending: str, packed: int, tmp_path: Path
     file.write("distortion_coefficients", np.array([D5]))
     file.release()
     check(read_cameras([tmp_path / f"a{ending}"]).cameras[0], E, D5)
+
+
+def openptv(folder: Path, centre: tuple[float, float], lens: list[float], glass: float) -> Path:
+    """Files of a camera of 640 x 480 pixels of 0.01 mm at (10, 20, 300), which looks along -z."""
+    (folder / "cal").mkdir()
+    (folder / "parameters").mkdir()
+    names = "img/a\ncal/a.tif\nimg/b\ncal/b.tif\n"
+    (folder / "parameters" / "ptv.par").write_text(
+        f"2\n{names}1\n0\n1\n640\n480\n0.01\n0.01\n0\n1\n{glass}\n{glass}\n5\n"
+    )
+    (folder / "cal" / "a.tif.addpar").write_text(" ".join(map(str, lens)))
+    angle = np.cos(0.3), np.sin(0.3)
+    dm = [[angle[0], 0, angle[1]], [0, 1, 0], [-angle[1], 0, angle[0]]]
+    rows = [
+        "10 20 300",
+        "0 0.3 0",
+        "",
+        *(" ".join(map(str, row)) for row in dm),
+        "",
+        f"{centre[0]} {centre[1]}",
+        "8.0",
+        "",
+        "0 0 50",
+    ]
+    (folder / "cal" / "a.tif.ori").write_text("\n".join(rows) + "\n")
+    return folder / "cal" / "a.tif.ori"
+
+
+@pytest.mark.parametrize(("centre", "most"), [((0.0, 0.0), 1e-3), ((0.12, -0.07), 0.02)])
+def test_a_camera_of_openptv_projects_as_its_formulas(
+    centre: tuple[float, float], most: float, tmp_path: Path
+) -> None:
+    k1, k2, k3, p1, p2, scale, shear = lens = [-2e-3, 4e-6, 0.0, 1e-5, -2e-5, 1.002, 0.001]
+    warnings: list[str] = []
+    found = read_cameras([openptv(tmp_path, centre, lens, 1.0)], warnings=warnings)
+    assert [w for w in warnings if "nearest camera" in w] == warnings[:1] if centre[0] else not warnings
+    assert found.cameras[0].image_size == S
+    world = np.random.default_rng(1).uniform([-110, -60, -40], [60, 90, 40], (200, 3))
+    dm = np.array([[np.cos(0.3), 0, np.sin(0.3)], [0, 1, 0], [-np.sin(0.3), 0, np.cos(0.3)]])
+    X, Y, Z = ((world - [10, 20, 300]) @ dm).T
+    x, y = -8.0 * X / Z + centre[0], -8.0 * Y / Z + centre[1]
+    r = np.hypot(x, y)
+    radial = k1 * r**2 + k2 * r**4 + k3 * r**6
+    x, y = (
+        x + x * radial + p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y,
+        y + y * radial + p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y,
+    )
+    x, y = scale * x - np.sin(shear) * y, np.cos(shear) * y
+    pixels = np.column_stack([x / 0.01 + 320, 240 - y / 0.01]) - 0.5
+    inside = ((pixels > 0) & (pixels < S)).all(axis=1)
+    assert inside.sum() > 50
+    (pose,) = found.poses.values()
+    got = found.cameras[0].project(pose.to_camera(world))[0]
+    assert np.abs(got - pixels)[inside].max() < most
+
+
+def test_the_pose_behind_glass_and_a_lack_of_pixels_are_told(tmp_path: Path) -> None:
+    place = openptv(tmp_path, (0.0, 0.0), [0, 0, 0, 0, 0, 1, 0], 1.33)
+    notes: list[str] = []
+    assert not read_cameras([place], notes).poses
+    assert "rays are broken at glass" in notes[0]
+    (tmp_path / "parameters" / "ptv.par").unlink()
+    with pytest.raises(FormatError, match=r"put ptv\.par, which has the size of the pixels"):
+        read_cameras([place])

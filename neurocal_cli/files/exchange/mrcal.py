@@ -13,7 +13,6 @@ from typing import Any
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
@@ -52,21 +51,15 @@ def read(document: Document) -> CameraSet:
             f"the lens model {model[:60]!r} is not known; convert it in mrcal first: "
             "mrcal-convert-lensmodel LENSMODEL_OPENCV8"
         )
-    values = _numbers(root["intrinsics"], 4 + _LENGTHS[model])
+    values = root["intrinsics"].array(4 + _LENGTHS[model])
     k = values[4:]
     k = k[:8] if len(k) == 12 and not k[8:].any() else k
     lens = Distortion(_BY_LENGTH[len(k)], k) if k.any() else Distortion()
-    width, height = _numbers(root["imagersize"], 2)
+    width, height = root["imagersize"].array(2)
     key = "rt_cam_ref" if "rt_cam_ref" in root else "extrinsics"
-    rt = _numbers(root[key], 6)
+    rt = root[key].array(6)
     camera = Camera(Intrinsics(*values[:4]), lens, (int(width), int(height)))
     return CameraSet((camera,), (), {REFERENCE: Pose(from_vector(rt[:3]), rt[3:])}, None, program="mrcal")
-
-
-def _numbers(field: Field, count: int) -> Array:
-    """Read the numbers of a list or a tuple."""
-    values = list(field.value) if isinstance(field.value, tuple) else field.value
-    return Field(values, field.source, field.path).array(count)
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:

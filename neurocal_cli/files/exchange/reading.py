@@ -23,6 +23,7 @@ from neurocal_cli.files.exchange import (
     mrcal,
     neurocal,
     odometry,
+    openptv,
     photographs,
     radial_curves,
     reconstruction,
@@ -32,7 +33,7 @@ from neurocal_cli.files.exchange import (
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.failures import source_of, value_failures
-from neurocal_cli.files.tree_fields import Field, is_number
+from neurocal_cli.files.tree_fields import Field
 
 # Formats that `convert` writes, by the values of its option ``--to``.
 FORMATS: dict[str, Format] = {
@@ -79,6 +80,7 @@ READ: tuple[Format, ...] = (
     datasets.MVSNET,
     datasets.KRTD,
     datasets.DROID,
+    openptv.FORMAT,
     direct_odometry.DSO,
     odometry.EUROC,
     kalibr.FORMAT,
@@ -100,7 +102,6 @@ READ: tuple[Format, ...] = (
     ros.FORMAT,
     dictionary.OPENCV,
 )
-_ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines of OpenPTV's file
 
 # What is known and cannot be read: how it begins, or how to tell it; what it is, and what to do.
 _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
@@ -133,13 +134,8 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
     ),
     (
-        lambda d: _numbers_in_lines(d) == _ORIENTATION,
-        "is an orientation of OpenPTV, in mm of the sensor, whose pixels are in another file; calibrate from "
-        "its points",
-    ),
-    (
-        lambda d: _numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
-        "is the distortion of a camera of OpenPTV, in mm of the sensor; calibrate from its points",
+        lambda d: openptv.numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
+        "is the distortion of a camera of OpenPTV, in mm of the sensor; give its .ori, beside this file",
     ),
     (
         lambda d: re.search(r"^ParGroup:", d.text[:2000], re.MULTILINE),
@@ -168,12 +164,6 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "names the files of its cameras, cam0_calib and so on; give these",
     ),
 )
-
-
-def _numbers_in_lines(document: Document) -> list[int]:
-    """How many numbers each line has; none if there are words, or many lines."""
-    lines = [line.split() for line in document.text[:2000].splitlines() if line.strip()]
-    return [len(line) for line in lines] if all(is_number(w) for line in lines for w in line) else []
 
 
 def _is(document: Document, sign: bytes | str | Callable[[Document], object]) -> object:
