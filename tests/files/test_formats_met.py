@@ -769,6 +769,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "coefficients beside it": ({"rgb": {"K": K}, "rgb_distortion": NAMED}, "may be the distortion"),
     "a coefficient with another name": ({"K": K, "lens_k1": -0.3}, "'lens_k1' may be the distortion"),
+    "one of two distortions": (
+        {"K1": K, "K2": K, "D1": D5, "lens 2": D5, "R": R, "T": SHIFT},
+        "the camera '2' has no distortion coefficients under a known name",
+    ),
     "an unknown coefficient": ({"K": K, "distortion": {"k1": -0.3, "m2": 0.1}}, "'m2' may be the distortion"),
     "packed numbers": ({"K": K, "lens_distortion_table": "AbCd" * 40}, "may be the distortion"),
     "several streams": (
@@ -930,3 +934,9 @@ def test_the_pose_behind_glass_and_a_lack_of_pixels_are_told(tmp_path: Path) -> 
     (tmp_path / "parameters" / "ptv.par").unlink()
     with pytest.raises(FormatError, match=r"put ptv\.par, which has the size of the pixels"):
         read_cameras([place])
+
+
+def test_another_camera_matrix_is_told(tmp_path: Path) -> None:
+    notes: list[str] = []
+    check(read_cameras([written({"K": K, "K_depth": HALVED, "D": D5}, tmp_path)], notes).cameras[0], E, D5)
+    assert "'K_depth' looks like another camera matrix, and is not read" in notes[0]

@@ -74,10 +74,17 @@ def from_tree(root: Field, document: Document) -> CameraSet:
         one = next((side for pair in _SIDES[:3] for side in pair if keys.has_camera(side)), "")
         camera = keys.camera("" if keys.has_camera() else one)
         keys.refuse_unread()
+        keys.note_others()
         note_size(camera, document)
         return CameraSet((camera,), (), _poses(root), unit)
     cameras = tuple(keys.camera(side) for side in sides)
     keys.refuse_unread()
+    lacking = [side for side in sides if not keys.has_coefficients(side)]
+    if len(lacking) == 1:
+        raise InputError(
+            f"the camera {lacking[0]!r} has no distortion coefficients under a known name, the other has; "
+            "name them alike, or add zeros"
+        )
     R, t = keys.find(_ROTATIONS), keys.find(_TRANSLATIONS)
     if R is None or t is None:
         raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")

@@ -51,6 +51,7 @@ from neurocal_cli.files.exchange.camera_names import (
     means,
     plain,
 )
+from neurocal_cli.files.exchange.document import camera_matrix
 from neurocal_cli.files.exchange.loose_values import (
     flat,
     has_entries,
@@ -197,6 +198,20 @@ class LooseKeys:
                     f"the key {str(key)[:60]!r} may be the distortion, and is not a known name of it; rename "
                     "it to distortion_coefficients, or remove it"
                 )
+
+    def note_others(self) -> None:
+        """Append a note on each other matrix that may be the camera's."""
+        for key, value in self.root.value.items():
+            if key in self.read or HARMLESS.search(plain(str(key))) or not isinstance(value, list):
+                continue
+            if len(value) == len(flat(value[0])) == 3 and camera_matrix(value) is not None:
+                self.notes.append(
+                    f"{self.root.source}: {str(key)[:60]!r} looks like another camera matrix, and is not read"
+                )
+
+    def has_coefficients(self, side: str) -> bool:
+        """Whether there are distortion coefficients of the camera of a side."""
+        return self._coefficients(side)[0] is not None
 
     coefficients_read = False
 
