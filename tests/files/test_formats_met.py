@@ -938,5 +938,18 @@ def test_the_pose_behind_glass_and_a_lack_of_pixels_are_told(tmp_path: Path) -> 
 
 def test_another_camera_matrix_is_told(tmp_path: Path) -> None:
     notes: list[str] = []
-    check(read_cameras([written({"K": K, "K_depth": HALVED, "D": D5}, tmp_path)], notes).cameras[0], E, D5)
+    check(
+        read_cameras(
+            [written({"K": K, "K_depth": HALVED, "D": D5, "observations": []}, tmp_path)], notes
+        ).cameras[0],
+        E,
+        D5,
+    )
     assert "'K_depth' looks like another camera matrix, and is not read" in notes[0]
+
+
+@pytest.mark.parametrize("text", ["iVBORw0KGgo", "a ", "[1, ", "\n", "k = [1, 2", "x: 1\n", "1 "])
+def test_a_long_text_without_a_camera_is_refused_at_once(text: str, tmp_path: Path) -> None:
+    # Patterns that go back over the text would take minutes for it.
+    with pytest.raises(FormatError):
+        read_cameras([written(text * (60_000 // len(text)), tmp_path)])

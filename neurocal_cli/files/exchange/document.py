@@ -35,9 +35,13 @@ FROM_ZERO = (
     "principal point"
 )
 # A matrix of OpenCV in C++.
-_FILLED = re.compile(r"(?:[\w:]+\s+)?(\w+)\s*=\s*\(\s*(?:cv::)?Mat_<\w+>\([\d, ]+\)\s*<<([^;)]*)\)")
+_FILLED = re.compile(
+    r"^[ \t]*(?:[\w:]{1,60}[ \t]+)?(\w{1,60})\s*=\s*\(\s*(?:cv::)?Mat_<\w+>\([\d, ]+\)\s*<<([^;)]*)\)",
+    re.MULTILINE,
+)
+_LONGEST = 20_000  # characters of a text that may state a camera
 _COEFFICIENTS = (4, 5, 8, 12, 14)
-_MATLAB = re.compile(r"=\s*\[[^\]\n]*;|^\s*%", re.MULTILINE).search
+_MATLAB = re.compile(r"=\s*\[[^\]\n]*;|^[ \t]*%", re.MULTILINE).search
 _MARK = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _HEAD = re.compile(r"\A\s*header:.*?^(?=height:)", re.MULTILINE | re.DOTALL)
 UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
@@ -294,6 +298,8 @@ def stated(text: str) -> dict[str, Any] | None:
     if len(lines) == 2 and len(lines[0]) == len(set(lines[0])) == len(lines[1]) > 3:
         tree: dict[str, Any] = dict(zip(lines[0], map(_value, lines[1]), strict=True))
         return None if any(map(is_number, lines[0])) else tree
+    if len(text) > _LONGEST:
+        return None
     tree = {}
     text = _FILLED.sub(r"\1 = [\2]", re.sub(r"^[ \t]*#define", "", text, flags=re.MULTILINE))
     text = re.sub(r"(?:[%#]|//)[^\n]*", "", text)

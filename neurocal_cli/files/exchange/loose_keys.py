@@ -204,7 +204,7 @@ class LooseKeys:
         for key, value in self.root.value.items():
             if key in self.read or HARMLESS.search(plain(str(key))) or not isinstance(value, list):
                 continue
-            if len(value) == len(flat(value[0])) == 3 and camera_matrix(value) is not None:
+            if len(value) == 3 and camera_matrix(value) is not None:
                 self.notes.append(
                     f"{self.root.source}: {str(key)[:60]!r} looks like another camera matrix, and is not read"
                 )
