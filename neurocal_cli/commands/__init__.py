@@ -42,7 +42,7 @@ _SUMMARIES = {
     "compare": "Compare calibration methods on the same points.",
     "convert": "Convert cameras, rigs and points to the formats of other programs.",
     "detect": "Detect boards in images and measure points on them.",
-    "drift": "Tell whether a camera has changed since an earlier calibration.",
+    "drift": "Tell whether a camera or a rig has changed since an earlier calibration.",
     "evaluate": "Measure the error of a calibrated camera or rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "rectify": "Rectify pairs of images and points of two cameras.",
