@@ -102,22 +102,25 @@ def contradicts_sigma(solution: Solution) -> bool:
     return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
 
 
-def contest_of(solution: Solution, fit: tuple[Problem, Adjusted] | None = None) -> Contest | None:
-    """The contest at a fit, by default that of the solution."""
+def contest_of(
+    solution: Solution, fit: tuple[Problem, Adjusted] | None = None, shaped: bool = False
+) -> Contest | None:
+    """The contest at a fit, by default that of the solution, whose target's shape was estimated or not."""
     problem, adjusted = fit or (solution.problem, solution.adjusted)
     return contest(
         problem.views, adjusted.state, problem.free_camera, problem.free_poses, problem.points.image_size,
         named_lens=solution.model_errors is None and solution.straight_lines is None,
-        worth=solution.repeated.worth,
+        worth=solution.repeated.worth, shaped=shaped,
     )  # fmt: skip
 
 
-def other_causes(solution: Solution, fit: tuple[Problem, Adjusted]) -> float:
+def other_causes(solution: Solution, fit: tuple[Problem, Adjusted], shaped: bool) -> float:
     """Log odds of other causes of a fit's errors than the target's shape, known or not; 0 if there are none.
 
-    The level by which they have to beat the target's shape is taken off.
+    The level by which they have to beat the target's shape is taken off. `shaped` tells whether its common
+    shape is estimated.
     """
-    held = contest_of(solution, fit)
+    held = contest_of(solution, fit, shaped)
     if held is None or not held.causes:
         return 0.0
     first = held.causes[0]

@@ -229,7 +229,7 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
     gain = gain_over_given(found, [given]) if common is None else found.evidence - common.evidence
-    return common if other_causes(solution, before) > gain else found
+    return common if other_causes(solution, before, common is not None) > gain else found
 
 
 def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:

@@ -17,8 +17,8 @@ from neurocal_cli.adjustment.residual_correlation import correlation, effective_
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
-from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates, including
-from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS
+from neurocal_cli.calibration.verdict.rival import SIZES, Estimate, Rival, estimates, including
+from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS, SHAPES
 from neurocal_cli.calibration.verdict.words import DETERMINE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -64,20 +64,35 @@ def contest(
     named_lens: bool = True,
     worth: float = 1.0,
     more: tuple[Rival, ...] = (),
+    shaped: bool = False,
 ) -> Contest | None:
     """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
 
     The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
     estimated. A lens that was selected is not too simple. `worth` is the effective share of the views if they
-    repeat poses. Rivals of this case alone may be given as `more`.
+    repeat poses. Rivals of this case alone may be given as `more`. `shaped` tells whether
+    the target's common shape was estimated with the camera.
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
     lin = linearised(views, state, free, free_poses, EFFECTS, image_size, named_lens)
+    if shaped:
+        lin = _with_shape(lin)
     try:
         return _held(lin, (*RIVALS, *more), worth)
     except np.linalg.LinAlgError:
         return None
+
+
+def _with_shape(lin: Linearised) -> Linearised:
+    """The same camera, with the common shape of the target as further unknowns.
+
+    A shape that was estimated first has taken in some of what other causes do.
+    """
+    new = np.concatenate([rival.steps_at(lin).argmax(axis=0) for rival in SHAPES])
+    R = lin.R.copy()
+    R[0, new, new] += lin.cost / lin.spare / SIZES[-1] ** 2  # some are open if all boards stand upright
+    return replace(lin, R=R, free=np.concatenate([lin.free, new]), spare=max(lin.spare - len(new), 1.0))
 
 
 def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
@@ -156,12 +171,12 @@ def _best(
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
-    shared = [one for one in others if one.weights.size]
-    for one in shared[:_AHEAD]:
+    unknown = ranking[0].rival.unknown  # any two causes come before that of none
+    for one in [one for one in others if unknown or one.weights.size][:_AHEAD]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
-        second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
+        second = [x for x in second if not x.rival.unknown and (unknown or "all" in (one.pattern, x.pattern))]
         if second and one.evidence + second[0].evidence > highest:
             best, highest = (one, second[0]), one.evidence + second[0].evidence
     return best

@@ -437,3 +437,11 @@ def test_small_contradictions_widen_the_std(real_files: RealFiles) -> None:
     for name in ("rescale", "drift"):
         found = calibrate(read_points(real_files(f"wrong_data/{name}.csv")[0]))
         assert found.std["alpha_u"] > 0.7
+
+
+def test_what_an_estimated_shape_has_taken_in_does_not_hide_another_cause() -> None:
+    bent, _ = target_photographed("parabola", 800, 14, 0.6, sigma=0.15)
+    camera = calibrate(rescaled(bent, np.arange(14) % 2 == 1, 1.01))
+    assert camera.target is not None
+    assert camera.verdict is not None
+    assert "scaled by 1.0" in camera.verdict.reasons[0]
