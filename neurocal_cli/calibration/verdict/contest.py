@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.residual_correlation import correlation, effective_
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
-from neurocal_cli.calibration.verdict.rival import SIZES, Estimate, Rival, estimates, including
+from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates, including
 from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS, SHAPES
 from neurocal_cli.calibration.verdict.words import DETERMINE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -32,6 +32,7 @@ _OF_EACH = 0.15  # the same after a cause that each view has in its own way, whi
 _FAR = 0.25  # the same after a cause that was fitted
 _PART = 0.3  # of the evidence: a good part
 _MUCH = 0.3  # share of the squared error
+_SHAPED = 0.003  # prior std of stretch and bends over the half length: prints are off by a few thousandths
 _LINEAR = 0.02  # of the focal length: largest difference of two cameras that is not fitted
 
 
@@ -91,7 +92,7 @@ def _with_shape(lin: Linearised) -> Linearised:
     """
     new = np.concatenate([rival.steps_at(lin).argmax(axis=0) for rival in SHAPES])
     R = lin.R.copy()
-    R[0, new, new] += lin.cost / lin.spare / SIZES[-1] ** 2  # some are open if all boards stand upright
+    R[0, new, new] += lin.cost / lin.spare / _SHAPED**2
     return replace(lin, R=R, free=np.concatenate([lin.free, new]), spare=max(lin.spare - len(new), 1.0))
 
 

@@ -20,8 +20,7 @@ from neurocal_cli.calibration.verdict.linearised import Effect, Linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
-SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))
-"""Prior standard deviations of an unknown."""
+_SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
 _NO_COST, _ROUNDING = 1e-12, 1e-9
 _ITERATIONS = 3  # the noise is what the rival leaves
 _ABSORBED = (
@@ -229,20 +228,20 @@ class _Effect:
         if not known.evidence(np.maximum(freely, _NO_COST * known.cost), np.zeros(1))[0] > least:
             return
         _, logdet = np.linalg.slogdet(known.M[:-1, :-1])
-        left = np.full(len(SIZES), known.cost)
+        left = np.full(len(_SIZES), known.cost)
         for _ in range(_ITERATIONS):
-            cost, by_size = by_precision(left / known.n / SIZES**2)
+            cost, by_size = by_precision(left / known.n / _SIZES**2)
             left = np.maximum(cost, _NO_COST * known.cost)
         evidence = known.evidence(left, by_size - logdet)
         best = int(np.argmax(evidence))
         noise = float(left[best]) / known.n
-        precision = noise / SIZES[best] ** 2
+        precision = noise / _SIZES[best] ** 2
         N = known.M - (turned.T / (values + precision)) @ turned
         camera = np.linalg.solve(N[:-1, :-1], N[:-1, -1])
         amounts = (turned[:, -1] - turned[:, :-1] @ camera) / (values + precision)
         yield Estimate(
             self.rival, "", float(evidence[best]), 1.0 - float(left[best]) / known.cost,
-            (vectors @ amounts.reshape(V, m, 1))[..., 0], np.zeros(0), camera, float(SIZES[best]), noise,
+            (vectors @ amounts.reshape(V, m, 1))[..., 0], np.zeros(0), camera, float(_SIZES[best]), noise,
         )  # fmt: skip
 
     def shared(self, known: _Known, least: float) -> Iterator[Estimate]:
@@ -261,9 +260,9 @@ class _Effect:
             reach = known.evidence(np.maximum(freely, _NO_COST * known.cost), 2 * np.log(choices))
             if not reach.max() > least:
                 continue
-            left = np.full((len(weights), len(SIZES)), known.cost)
+            left = np.full((len(weights), len(_SIZES)), known.cost)
             for _ in range(_ITERATIONS):
-                precision = left / known.n / SIZES**2
+                precision = left / known.n / _SIZES**2
                 gained = (turned[:, None] ** 2 / (values[:, None] + precision[..., None])).sum(axis=2)
                 left = np.maximum(known.cost - gained, _NO_COST * known.cost)
             spread = np.log1p(values[:, None] / precision[..., None]).sum(axis=2)
@@ -273,7 +272,7 @@ class _Effect:
             camera = known.right - known.inverse @ (X[p].T @ amounts)
             yield Estimate(
                 self.rival, name, float(evidence[p, k]), 1.0 - float(left[p, k]) / known.cost, amounts,
-                weights[p], camera, float(SIZES[k]), float(left[p, k]) / known.n,
+                weights[p], camera, float(_SIZES[k]), float(left[p, k]) / known.n,
             )  # fmt: skip
 
 
