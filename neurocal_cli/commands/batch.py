@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -291,10 +292,8 @@ class _Batch:
 
         outcome = self._outcomes.get(job.name)
         known = outcome is not None and outcome.seconds is not None
-        rows: list[dict[str, Any]] = (
-            read_record(os.path.join(self._folder, job.name)).get("rows", []) if known else []
-        )
-        return rows
+        rows = read_record(os.path.join(self._folder, job.name)).get("rows", []) if known else []
+        return [{_once(key): _once(value) for key, value in row.items()} for row in rows]
 
     def _write(self, changes: dict[tuple[str, str], dict[str, Any]]) -> list[dict[str, Any]]:
         """Write the summary of what is done, at once, and return its rows."""
@@ -355,3 +354,8 @@ class _Batch:
 
 def _named(row: dict[str, Any]) -> str:
     return f"{row['name']} {row['camera']}".strip()
+
+
+def _once(value: Any) -> Any:
+    """A value of a row; the same words in thousands of rows are kept once."""
+    return sys.intern(value) if isinstance(value, str) else value

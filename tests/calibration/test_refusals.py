@@ -124,6 +124,7 @@ def test_parallel_boards_are_refused_with_and_without_noise(
     refused(see([BOARD] * n_views, poses, sigma, n_views), distortion="none", **HELD[options])
 
 
+@pytest.mark.slow
 def test_views_that_determine_no_camera_determine_no_bends() -> None:
     test_parallel_boards_are_refused_with_and_without_noise("parallel to the image", "centre", 20, 0.05)
 

@@ -223,7 +223,7 @@ def test_a_steady_rig_has_no_delays() -> None:
 def test_stated_times_are_used_where_they_explain_more() -> None:
     rng = np.random.default_rng(4)
     rig = random_rig("line", 3, 7, rng)
-    frames, points = 100, {}
+    frames, points = 40, {}
     for name in rig.cameras:
         jitter = rng.uniform(-0.3, 0.3, frames)
         _, then = steady(rig, frames, jitter)
