@@ -48,4 +48,4 @@ def test_a_rig_and_a_camera_are_not_compared(rig: Path, tmp_path: Path) -> None:
     assert run("calibrate", SAMPLES / "stereo_left.csv", "--distortion", "k1", "-o", camera).exit_code == 0
     found = run("drift", rig, camera)
     assert found.exit_code == 1
-    assert "give two of a kind" in found.output
+    assert "give two of a kind" in found.stderr
