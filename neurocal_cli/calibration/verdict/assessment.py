@@ -335,7 +335,7 @@ class _AtMinimum:
         selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
         held = contest(
             views, state, self.free, self.free_poses, self.points.image_size, named_lens=not selected,
-            worth=self.repeated.worth, shaped=target is not None and not target.only_bends,
+            worth=self.repeated.worth, shaped=target is not None and target.bends is None,
         )  # fmt: skip
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
         return held and replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))

@@ -172,12 +172,11 @@ def _best(
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
-    unknown = ranking[0].rival.unknown  # any two causes come before that of none
-    for one in [one for one in others if unknown or one.weights.size][:_AHEAD]:
+    for one in [one for one in others if one.weights.size][:_AHEAD]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
-        second = [x for x in second if not x.rival.unknown and (unknown or "all" in (one.pattern, x.pattern))]
+        second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
         if second and one.evidence + second[0].evidence > highest:
             best, highest = (one, second[0]), one.evidence + second[0].evidence
     return best
