@@ -159,6 +159,10 @@ def _serve(connection: Connection, work: Callable[[Task], Result], prepare: Call
 def interrupts_held() -> Iterator[None]:
     """Put interrupts off. Processes that start meanwhile never get any, not even while they load modules."""
     mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
+    if mask:
+        from multiprocessing import resource_tracker
+
+        resource_tracker.ensure_running()  # started with the first process, it would let them through
     former = mask(signal.SIG_BLOCK, {signal.SIGINT}) if mask else None
     try:
         yield
