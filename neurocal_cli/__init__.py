@@ -41,15 +41,14 @@ if TYPE_CHECKING:
     from neurocal_cli.detection.detect import Detection, detect_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_yaml import read_calibration
     from neurocal_cli.files.images import read_image
     from neurocal_cli.files.lens_points import read_lens_data, read_lens_points
     from neurocal_cli.files.lens_yaml import read_lens, write_lens
     from neurocal_cli.files.points_csv import read_points, write_points
     from neurocal_cli.files.result_files import write_calibration, write_rig
     from neurocal_cli.files.rig_points import read_rig_points
-    from neurocal_cli.files.rig_yaml import read_rig
-    from neurocal_cli.files.stereo_yaml import read_stereo_rig
+    from neurocal_cli.files.rig_yaml import read_rig, read_stereo_rig
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.points import Correspondences
     from neurocal_cli.observations.target import Target
@@ -95,14 +94,14 @@ _HOMES = {
     "fit_stereo": "calibration.rig.calibrate_stereo",
     "plot": "commands.show.results",
     "read_board": "files.board_yaml",
-    "read_calibration": "files.calibration_tree",
+    "read_calibration": "files.calibration_yaml",
     "read_rig": "files.rig_yaml",
     "read_image": "files.images",
     "read_lens": "files.lens_yaml",
     "read_lens_data": "files.lens_points",
     "read_lens_points": "files.lens_points",
     "read_points": "files.points_csv",
-    "read_stereo_rig": "files.stereo_yaml",
+    "read_stereo_rig": "files.rig_yaml",
     "read_rig_points": "files.rig_points",
     "rectify": "calibration.rig.rectification",
     "report": "commands.show.results",

@@ -84,5 +84,5 @@ class Presented(Summarised):
         InputError
             The format cannot represent the result; the message says why, and what can be done.
         """
-        found: Converted = late("files.exchange.converted", "converted")(self, to, model, force, ending)
+        found: Converted = late("files.exchange.reading", "converted")(self, to, model, force, ending)
         return found

@@ -46,7 +46,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise rig.yaml --next 1
     """  # noqa: D301 - as in the group
     preparation.check((calibration,), plots=(plot,))
-    from neurocal_cli.files.file_storage import read_tree
+    from neurocal_cli.files.camera_tree import read_tree
 
     root = read_tree(calibration)
     if "stereo" in root or "rig" in root:
@@ -55,7 +55,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     from neurocal_cli.calibration.advice import advise as weigh
     from neurocal_cli.commands.show.advice import advice_json, advice_lines
     from neurocal_cli.commands.show.advised_views import draw_advice
-    from neurocal_cli.files.calibration_tree import calibration_from_field
+    from neurocal_cli.files.calibration_yaml import calibration_from_field
 
     known = calibration_from_field(root)
     with ProgressBar("comparing views"):

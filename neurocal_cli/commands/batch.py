@@ -135,9 +135,7 @@ def batch(
     if not cluster.is_installed() and (workers or scheduler):
         raise NeurocalError(f"{chosen[0]} needs Dask; pip install 'dask[distributed]', or use --jobs")
     from neurocal_cli.commands.batch_jobs import job_of
-    from neurocal_cli.files.fleet_csv import read_fleet
-    from neurocal_cli.files.job_files import locked
-    from neurocal_cli.files.manifest import read_data_sets
+    from neurocal_cli.files.batch_files import locked, read_data_sets, read_fleet
 
     former = {} if against is None else read_fleet(against)
     folder = os.path.realpath(output)
@@ -173,7 +171,7 @@ def _runner(
 def _check_shared(client: Any, folder: str) -> None:
     """Refuse workers that do not see the folder of the results."""
     from neurocal_cli.commands import cluster
-    from neurocal_cli.files.job_files import owner_of
+    from neurocal_cli.files.batch_files import owner_of
 
     path, owner = owner_of(folder)
     blind = cluster.see(client, path, owner)
@@ -288,7 +286,7 @@ class _Batch:
 
     def _recorded(self, job: Job) -> list[dict[str, Any]]:
         """The rows of a job, read from its record when they are needed: those of a large fleet are large."""
-        from neurocal_cli.files.job_files import read_record
+        from neurocal_cli.files.batch_files import read_record
 
         outcome = self._outcomes.get(job.name)
         known = outcome is not None and outcome.seconds is not None
@@ -299,7 +297,7 @@ class _Batch:
         """Write the summary of what is done, at once, and return its rows."""
         from neurocal_cli.commands.batch_rows import fleet_rows
         from neurocal_cli.commands.show.fleet_page import fleet_page
-        from neurocal_cli.files.fleet_csv import format_fleet
+        from neurocal_cli.files.batch_files import format_fleet
         from neurocal_cli.files.writing import write_at_once
 
         rows = fleet_rows(self._jobs, self._outcomes, changes, self._recorded)

@@ -31,7 +31,7 @@ def compare(pair: Pair) -> dict[str, Any]:
 
 def _compared(pair: Pair) -> dict[str, Any]:
     from neurocal_cli.calibration.drift import find_drift
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_yaml import read_calibration
 
     try:
         if not pair.camera:

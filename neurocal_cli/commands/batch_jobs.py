@@ -20,7 +20,7 @@ from neurocal_cli.commands.options import PATH
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
 if TYPE_CHECKING:
-    from neurocal_cli.files.manifest import DataSet
+    from neurocal_cli.files.batch_files import DataSet
 
 Words = tuple[str, ...]
 

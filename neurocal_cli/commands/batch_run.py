@@ -24,7 +24,7 @@ from neurocal_cli.commands.batch_jobs import LOG, Job, Outcome, Words, parsed
 from neurocal_cli.commands.batch_rows import rows_of
 from neurocal_cli.commands.streams import captured, one_line, tell
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.files.job_files import (
+from neurocal_cli.files.batch_files import (
     RECORD,
     fingerprints,
     is_of_machine,

@@ -151,7 +151,7 @@ class Estimation:
             if not (isinstance(camera, Calibration) and camera.known_covariance[0]):
                 _note_exact(f"{self.intrinsics} does not say how accurate its camera is, so it")
         elif self.extrinsics is not None:
-            from neurocal_cli.files.calibration_tree import read_extrinsics
+            from neurocal_cli.files.calibration_yaml import read_extrinsics
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
             _note_exact("each given pose")

@@ -49,7 +49,7 @@ class _Group(options.Group):
 
 def _kind_of(file: str) -> str:
     """The command that judges a file, by the keys of its first lines."""
-    from neurocal_cli.files.file_storage import read_tree
+    from neurocal_cli.files.camera_tree import read_tree
 
     root = read_tree(file)
     if "neurocal_lens" in root:
@@ -411,11 +411,11 @@ def _evaluate_stereo(
     from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
 
     if len(cameras) == 1:
-        from neurocal_cli.files.stereo_yaml import read_stereo_rig
+        from neurocal_cli.files.rig_yaml import read_stereo_rig
 
         rig = read_stereo_rig(cameras[0])
         return evaluate_stereo_rig(rig, points, method=method), rig
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_yaml import read_calibration
 
     if points is None:
         left, right = (read_calibration(name) for name in cameras)

@@ -11,8 +11,8 @@ import numpy as np
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.commands.streams import end_waiting, note, print_summary, say, warn
 from neurocal_cli.errors import InputError, plural
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.plane_csv import Batch, format_plane_points, read_pixels
+from neurocal_cli.files.calibration_yaml import read_calibration
+from neurocal_cli.files.measurement_csv import Batch, format_plane_points, read_pixels
 from neurocal_cli.files.writing import write_chunks
 
 if TYPE_CHECKING:

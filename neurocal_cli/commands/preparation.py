@@ -152,7 +152,7 @@ def calibration_or_camera(
 ) -> tuple[Calibration | Camera, Correspondences | None]:
     """Read a calibration or, for points, any camera; if it is neither, the error says why no calibration."""
     from neurocal_cli.camera.camera import camera_of
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_yaml import read_calibration
 
     try:
         return read_calibration(name), points

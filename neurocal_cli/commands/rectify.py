@@ -279,7 +279,7 @@ class _Work:
 
     def write_maps(self) -> None:
         """Write the tables and matrices."""
-        from neurocal_cli.files.exchange.dictionary_texts import npz_bytes
+        from neurocal_cli.files.exchange.dictionary import npz_bytes
 
         tree = {}
         for side, remapping in zip(_SIDES, self.remappings, strict=True):

@@ -63,7 +63,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     preparation.check((result,), (output,))
     import hashlib
 
-    from neurocal_cli.files.file_storage import parse_tree
+    from neurocal_cli.files.camera_tree import parse_tree
 
     data, source = read_bytes(result)
     root = parse_tree(decode(data, source, "a calibration"), source)
@@ -85,7 +85,7 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
 
         result, block, cameras, none = lens_from_field(root), None, [], "a zoom lens"
     elif "stereo" in root:
-        from neurocal_cli.files.stereo_yaml import stereo_from_field
+        from neurocal_cli.files.rig_yaml import stereo_from_field
 
         result = rig = stereo_from_field(root)
         block, cameras, none = root["left"], [rig.left, rig.right], ""
@@ -95,7 +95,7 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
         result = found = rig_from_field(root)
         block, cameras, none = root["cameras"][found.first], [], "a rig of named cameras"
     else:
-        from neurocal_cli.files.calibration_tree import calibration_from_field
+        from neurocal_cli.files.calibration_yaml import calibration_from_field
 
         result = calibration = calibration_from_field(root)
         block, cameras, none = root, [calibration], ""

@@ -10,7 +10,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, suggest, warn
-from neurocal_cli.files.failures import source_of, value_failures
+from neurocal_cli.errors import source_of, value_failures
 
 if TYPE_CHECKING:
     from neurocal_cli.camera.camera import Camera

@@ -231,7 +231,7 @@ def _scene(
         board = read_board(board_file)
     if camera_file is not None:
         from neurocal_cli.camera.camera import camera_of
-        from neurocal_cli.files.calibration_tree import read_calibration
+        from neurocal_cli.files.calibration_yaml import read_calibration
 
         own = board_file is None and views is None and camera_file != "-"
         if own:

@@ -143,7 +143,7 @@ def stereo(
         if not preparation.is_for_the_eye(output, "rig.yaml"):
             warn(*write_result(rig, output, lean=lean, alpha=alpha))
         if ros is not None:
-            from neurocal_cli.files.stereo_yaml import format_ros_pair
+            from neurocal_cli.files.rig_yaml import format_ros_pair
 
             for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
                 write_whole(name, text)

@@ -47,7 +47,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
     from neurocal_cli.commands.show.camera_panels import draw_target
     from neurocal_cli.commands.show.camera_report import target_json, target_lines
     from neurocal_cli.files.board_yaml import read_board, write_board
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_yaml import read_calibration
     from neurocal_cli.observations.target import board_of
 
     calibration = read_calibration(camera)

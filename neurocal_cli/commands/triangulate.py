@@ -17,7 +17,7 @@ from neurocal_cli.files.writing import write_chunks
 if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import Triangulated
-    from neurocal_cli.files.triangulation_csv import Matches
+    from neurocal_cli.files.measurement_csv import Matches
 
 _USUAL_SIGMA = 0.5  # px; default for a rig without points
 _LARGEST_SIGMA = 1e6  # px; no image is that large
@@ -141,7 +141,7 @@ def triangulate(
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
-    from neurocal_cli.files.triangulation_csv import format_space_points, read_matches
+    from neurocal_cli.files.measurement_csv import format_space_points, read_matches
 
     if sigma is None and math.isnan(rig.sigma):
         note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
@@ -164,8 +164,8 @@ def triangulate(
 
 def _of_many(rig: str, matches: str) -> bool:
     """Whether the rig has other than two cameras, or the matches are those of named cameras."""
+    from neurocal_cli.files.measurement_csv import has_sightings
     from neurocal_cli.files.rig_yaml import has_cameras
-    from neurocal_cli.files.triangulation_csv import has_sightings
 
     return (matches != "-" and has_sightings(matches)) or (rig != "-" and has_cameras(rig))
 
@@ -176,8 +176,8 @@ def _triangulate_many(
     """Triangulate points from any number of cameras."""
     from neurocal_cli.calibration.rig.many_views import triangulate_many
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
+    from neurocal_cli.files.measurement_csv import format_many_points, read_sightings
     from neurocal_cli.files.rig_yaml import read_rig
-    from neurocal_cli.files.triangulation_csv import format_many_points, read_sightings
 
     rig = read_rig(file)
     preparation.warn_of_poor(rig, "; points in space may be far off")
@@ -213,13 +213,13 @@ def _triangulate_many(
 def _rig(names: tuple[str, ...]) -> StereoRig:
     """The rig of the file, or one that is fitted to two calibrations."""
     if len(names) == 1:
-        from neurocal_cli.files.stereo_yaml import read_stereo_rig
+        from neurocal_cli.files.rig_yaml import read_stereo_rig
 
         rig = read_stereo_rig(names[0])
         preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
     from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_yaml import read_calibration
 
     left, right = (read_calibration(name) for name in names)
     rig = fit_stereo(left, right)

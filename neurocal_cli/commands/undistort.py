@@ -293,7 +293,7 @@ class _Undistorting:
 
     def write_maps(self, path: str) -> None:
         """Write the remapping tables, and the camera of the images that they produce."""
-        from neurocal_cli.files.exchange.dictionary_texts import npz_bytes
+        from neurocal_cli.files.exchange.dictionary import npz_bytes
 
         u, v = self.remapping.tables()
         write_whole(path, npz_bytes({"u": u, "v": v, **self._described()}))

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibration import Rejected, Verdict, ViewResult
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, rotation_to_euler
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
-from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.key_tables import Keys, record
-from neurocal_cli.files.text_columns import (
+from neurocal_cli.errors import value_failures
+from neurocal_cli.files.key_tables import (
+    Keys,
     as_fields,
     column_lines,
     named_lines,
@@ -24,6 +24,7 @@ from neurocal_cli.files.text_columns import (
     read_columns,
     read_named,
     read_table,
+    record,
     table_lines,
 )
 from neurocal_cli.files.tree_fields import Field

@@ -18,8 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.failures import one_line
+from neurocal_cli.errors import FormatError, InputError, one_line
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
 

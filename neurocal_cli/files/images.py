@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.errors import FormatError, InputError, NeurocalError
-from neurocal_cli.files.failures import one_line, reading_failures
+from neurocal_cli.errors import FormatError, InputError, NeurocalError, one_line, reading_failures
 from neurocal_cli.files.image_files import Header, is_video_header, read_header
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_at_once

@@ -1,32 +1,200 @@
-"""Tables of keys: what a block of our own files holds, written and read by the same table.
+"""Tables by which blocks of our own files are written and read: keys of one object, and columns of many.
 
-A table is a text, ``"seed: integer, center=centre?: pair"``: the names of keys, those of the attributes with
-their values if they differ, and kinds. A key with ``?`` is left out of the file if its value is the empty one
-of its kind, which it has if it is left out. Sizes such as ``3x4`` are arrays; ``n`` is any length.
+A table of keys is a text, ``"seed: integer, center=centre?: pair"``: the names of keys, those of the
+attributes with their values if they differ, and kinds. A key with ``?`` is left out of the file if its value
+is the empty one of its kind, which it has if it is left out. Sizes such as ``3x4`` are arrays; ``n`` is any
+length.
+
+Long columns are texts of comma-separated numbers, ``X: ['0.0,20.0,40.0']``, or packed. PyYAML's pure-Python
+parser takes 50 us per number, but only 0.3 us per character of a text. A number of 17 digits has 20
+characters as a decimal, 11 in base64, and 4 packed: each of these is a character of Unicode's private use
+area that encodes two bytes of a float64. A text has at most 160 numbers, because OpenCV's FileStorage refuses
+texts of more than 4095 bytes.
+
+Values by view name are a mapping if all names are valid keys of FileStorage. Otherwise they are a list of
+pairs, because FileStorage cannot open a file with a key such as ``"01"``.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
     block,
     boolean,
     flow,
+    flows,
+    indented,
     list_lines,
     mapping,
     number,
     quoted,
     quoted_words,
+    text,
     words,
 )
-from neurocal_cli.files.yaml_text import text as plain_text
+
+LONGEST = 160  # numbers in a text, each with at most 24 characters
+
+_PRIVATE = 0xF0000  # the first of 65536 characters of a private use area
+
+_NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
+_RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
+_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*").fullmatch
+
+
+def number_words(values: NDArray[Any]) -> list[str]:
+    """Write each number as text; ``null`` if it is not finite."""
+    flat = np.ravel(values)
+    return list(map(str, flat.tolist())) if flat.dtype.kind in "iu" else flows(flat)
+
+
+def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterator[str]:
+    """Lines of a table, one per column: arrays as texts of numbers, labels as single texts."""
+    for name, values in columns.items():
+        if isinstance(values, np.ndarray):
+            words = number_words(values)
+            parts = [f"'{','.join(words[k : k + LONGEST])}'" for k in range(0, len(words), LONGEST)]
+        else:
+            parts = list(map(quoted, values))
+        yield f"{name}: [{', '.join(parts)}]"
+
+
+def table_lines(
+    columns: Mapping[str, NDArray[Any] | Sequence[str]], long: bool, indent: int = 4
+) -> Iterator[str]:
+    """Lines of a table: ``columns`` and ``rows``, or only ``columns`` if it is long."""
+    if long:
+        yield from block("columns", column_lines(columns))
+        return
+    cells = [
+        number_words(values) if isinstance(values, np.ndarray) else map(quoted, values)
+        for values in columns.values()
+    ]
+    yield f"columns: [{', '.join(columns)}]"
+    yield "rows:"
+    yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
+
+
+def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
+    """Read either form of a table as columns, each a list of values."""
+    if isinstance(field["columns"].value, dict):
+        table = read_columns(field["columns"], labels)
+    else:
+        names = field["columns"].texts()
+        rows = [row.value for row in field["rows"].items()]
+        if len(set(names)) < len(names) or any(
+            type(row) is not list or len(row) != len(names) for row in rows
+        ):
+            field.fail(f"a table with {len(names)} columns")
+        table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
+    return as_fields(table, field)
+
+
+def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
+    """Read a table back: numbers (None for null), and text in the columns called `labels`."""
+    columns: dict[str, list[Any]] = {
+        name: column.texts() if name in labels else read_numbers(list(column.items()))
+        for name, column in field.entries().items()
+    }
+    if len(set(map(len, columns.values()))) > 1:
+        field.fail("columns of one length")
+    return columns
+
+
+def as_fields(columns: Mapping[str, list[Any]], table: Field) -> dict[str, Field]:
+    """Make a field of each column of a table."""
+    return {name: Field(values, table.source, f"{table.path}.{name}") for name, values in columns.items()}
+
+
+def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool = False) -> Array:
+    """(k, N) numbers of some columns; NaN for null, which must be allowed by `unknown`."""
+    return np.array([columns[name].array(-1, unknown=unknown) for name in names])
+
+
+def read_numbers(texts: Sequence[Field]) -> list[Any]:
+    """Read the numbers of texts, None for null; they may be infinite."""
+    for entry in texts:
+        if not _NUMBERS(entry.text()):
+            entry.fail("numbers with commas between them")
+    try:
+        return list(json.loads(f"[{','.join(entry.value for entry in texts)}]"))
+    except ValueError:
+        texts[0].fail("numbers with commas between them")
+
+
+def packed_text(values: NDArray[Any]) -> str:
+    """Write numbers as packed float64 in quotes, with four characters per number."""
+    words = np.ascontiguousarray(values, dtype="<f8").view("<u2").astype("<u4") + _PRIVATE
+    return f"'{words.tobytes().decode('utf-32-le')}'"
+
+
+def read_packed(entry: Field) -> list[float]:
+    """Read the numbers of `packed_text`; they may be infinite."""
+    codes = np.frombuffer(entry.text().encode("utf-32-le", "surrogatepass"), dtype="<u4")
+    if len(codes) % 4 or np.any(codes >> 16 != _PRIVATE >> 16):
+        entry.fail("packed numbers, four characters from U+F0000 on for each")
+    return codes.astype("<u2").view("<f8").tolist()
+
+
+def join_ranges(numbers: NDArray[np.int64]) -> str:
+    """Write whole numbers as ranges, ``0-92,95,97-99``."""
+    cuts = np.flatnonzero(np.diff(numbers) != 1)
+    first = numbers[np.concatenate([[0], cuts + 1])].tolist()
+    last = numbers[np.concatenate([cuts, [len(numbers) - 1]])].tolist()
+    return ",".join(f"{a}-{b}" if a < b else f"{a}" for a, b in zip(first, last, strict=True))
+
+
+def read_ranges(field: Field, below: int) -> list[int]:
+    """Read ranges of whole numbers below a limit back."""
+    text = field.text()
+    if not _RANGES(text):
+        field.fail("whole numbers and ranges such as 0-92")
+    numbers: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        if int(last or first) >= below:
+            field.fail(f"numbers below {below}")
+        numbers.extend(range(int(first), int(last or first) + 1))
+    return numbers
+
+
+def named_lines(key: str, names: Iterable[str], values: Iterable[str]) -> Iterator[str]:
+    """Lines of a key whose value has an entry for each name; `values` are YAML flow texts."""
+    names = list(names)
+    pairs = zip(names, values, strict=True)
+    if not names:
+        yield f"{key}: {{}}"
+    elif all(_KEY(name) and text(name) == name for name in names):
+        yield from block(key, (f"{name}: {value}" for name, value in pairs))
+    else:
+        yield from block(key, (f"- [{quoted(name)}, {value}]" for name, value in pairs))
+
+
+def read_named(field: Field) -> dict[str, Field]:
+    """Read either form back; no name may appear twice."""
+    if isinstance(field.value, dict):
+        return field.entries()
+    found: dict[str, Field] = {}
+    for entry in field.items():
+        parts = list(entry.items())
+        if len(parts) != 2:
+            entry.fail("a name and its value")
+        name = parts[0].text()
+        if name in found:
+            parts[0].fail("a name that no other entry has")
+        found[name] = parts[1]
+    return found
+
 
 _ENTRY = re.compile(r"\s*(\w+)(?:=(\w+))?(\?)?(?::\s*([\w ]+?))?\s*").fullmatch
 
@@ -69,7 +237,7 @@ def _estimate(field: Field) -> tuple[float, float]:
 
 
 _KINDS = {
-    "text": inline(Field.text, lambda value: plain_text(str.__str__(value))),
+    "text": inline(Field.text, lambda value: text(str.__str__(value))),
     "integer": inline(Field.integer, lambda value: str(int(value))),
     "boolean": inline(Field.boolean, boolean, False),
     "number": inline(Field.number, number, 0.0),
@@ -161,7 +329,7 @@ def named(word: str | Kind, empty: Any = None) -> Kind:
     return Kind(
         lambda field: {name: kind.read(entry) for name, entry in field.entries().items()},
         lambda key, values, long: block(
-            key, [line for name in values for line in kind.lines(plain_text(name), values[name], long)]
+            key, [line for name in values for line in kind.lines(text(name), values[name], long)]
         ),
         empty,
     )

@@ -15,10 +15,9 @@ from neurocal_cli.calibration.zoom.settings import CONTROLS, Constants, Normal, 
 from neurocal_cli.calibration.zoom.zoom_lens import Member, RejectedSetting, ZoomLens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
-from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.key_tables import Keys, Kind, inline, record
-from neurocal_cli.files.text_columns import table_lines
+from neurocal_cli.files.key_tables import Keys, Kind, inline, record, table_lines
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
 from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, quoted, read_yaml, text

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
-from neurocal_cli.files.text_columns import (
+from neurocal_cli.errors import value_failures
+from neurocal_cli.files.key_tables import (
     LONGEST,
     column_lines,
     join_ranges,
@@ -27,6 +26,7 @@ from neurocal_cli.files.text_columns import (
     read_packed,
     read_ranges,
 )
+from neurocal_cli.files.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import flow, indented, number, quoted
 from neurocal_cli.observations.distances import Distance

@@ -13,8 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import IO
 
-from neurocal_cli.errors import FormatError, NeurocalError
-from neurocal_cli.files.failures import one_line, reading_failures
+from neurocal_cli.errors import FormatError, NeurocalError, one_line, reading_failures
 from neurocal_cli.files.writing import held_back
 
 _IMAGES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")  # how PNG, JPEG, BMP and TIFF begin

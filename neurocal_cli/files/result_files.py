@@ -74,7 +74,7 @@ def write_result(
 
 def _rig_text(rig: StereoRig | Rig, alpha: float | None, by_rows: bool) -> str:
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
-    from neurocal_cli.files.stereo_yaml import format_stereo_rig
+    from neurocal_cli.files.rig_yaml import format_stereo_rig
 
     if isinstance(rig, StereoRig):
         return format_stereo_rig(rig, alpha, by_rows)

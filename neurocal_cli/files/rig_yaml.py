@@ -1,33 +1,178 @@
-"""Files of rigs of any number of cameras: the cameras, their poses and the views that connect them, in YAML.
+"""Rig files: the cameras, their poses and the views that connect them, in one YAML file.
 
-``cameras`` holds the content of a calibration file for each camera, ``poses`` the pose of each relative to
-the first, ``edges`` the pairs of cameras that see common frames, and ``rig`` the rest. A rig of two cameras
-also has the blocks of a stereo rig (`stereo_yaml`), which hold its cameras with all their data; those in
-``cameras`` are then without points and poses.
+The file of a stereo rig has ``left`` and ``right`` with the content of a calibration file, each with the
+rectification and projection matrices of the rectified pair. ``stereo`` has the rest.
+
+In that of any number of cameras, ``cameras`` holds the content of a calibration file for each camera,
+``poses`` the pose of each relative to the first, ``edges`` the pairs of cameras that see common frames, and
+``rig`` the rest. A rig of two cameras also has the blocks of a stereo rig, which hold its cameras with all
+their data; those in ``cameras`` are then without points and poses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from neurocal_cli.calibration.rig.rectification import Rectification, rectify
 from neurocal_cli.calibration.rig.rig import Rig, of_two
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import VERDICT
-from neurocal_cli.files.calibration_tree import calibration_from_field
-from neurocal_cli.files.calibration_yaml import HEADER, calibration_lines
-from neurocal_cli.files.file_storage import read_tree
+from neurocal_cli.files.calibration_blocks import POSE_GROUPS, VERDICT
+from neurocal_cli.files.calibration_yaml import HEADER, calibration_from_field, calibration_lines
+from neurocal_cli.files.camera_tree import read_tree
+from neurocal_cli.files.exchange.camera_set import METRES
 from neurocal_cli.files.key_tables import Keys, inline, named, record
-from neurocal_cli.files.stereo_yaml import RESULT, stereo_from_field, stereo_lines
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import block, boolean, list_lines, text
 
-FORMAT = 1  # of the block rig; to be raised if older readers cannot read a change
+STEREO_FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
+# E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
+_SAME = 1e-6
+
+RESULT = "rmse_px: measure, max_px: measure, converged: boolean, stop_reason: text, iterations: integer"
+"""Keys of every rig."""
+_GROUPS = {group: Keys(", ".join(f"{n}: estimate" for n in names)) for group, names in POSE_GROUPS}
+_POSE = Keys(
+    "unit: text, R: 3x3, t: 3, E: 3x3, F: 3x3, baseline: number, baseline_std: measure, rotation: rotation,"
+    f"translation: translation, covariance: covariance, {RESULT}, delay?: delay",
+    {
+        **{group: record(dict, keys, inline=True) for group, keys in _GROUPS.items()},
+        "covariance": record(dict, Keys("names: names, data: square"), inline=True),
+        "delay": record(dict, Keys("value: number, std: measure, timed: boolean"), inline=True),
+    },
+    baseline_std=lambda rig: rig.std["baseline"],
+    rotation=lambda rig: dict(_estimates(rig)[:3]),
+    translation=lambda rig: dict(_estimates(rig)[3:]),
+    covariance=lambda rig: {"names": POSE_NAMES, "data": rig.covariance},
+    delay=lambda rig: rig.delay and dict(zip(("value", "std"), rig.delay, strict=True), timed=rig.timed),
+)
+_RECTIFICATION = Keys("R1: nxn, R2: nxn, P1: nxn, P2: nxn, Q: nxn")
+_REST = Keys(
+    "pairs: pairs of texts, left_out: reasons, warnings: lines, verdict=judgement?: verdict",
+    {"verdict": VERDICT},
+    verdict=lambda rig: rig.verdict,
+)
+
+
+def format_stereo_rig(rig: StereoRig, alpha: float | None = None, by_rows: bool = False) -> str:
+    """Text of a rig file; for `alpha` see `rectify`, for `by_rows` see `format_calibration`."""
+    return "\n".join([*HEADER, *stereo_lines(rig, alpha, by_rows), ""])
+
+
+def stereo_lines(rig: StereoRig, alpha: float | None, by_rows: bool) -> Iterator[str]:
+    """Lines of the blocks left, right and stereo."""
+    rectified = rectify(rig, alpha)
+    pairs: tuple[tuple[Array, Array] | None, ...] = (None, None)
+    if rectified is not None:
+        pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
+    cameras = zip(("left", "right"), (rig.left, rig.right), pairs, strict=True)
+    parts = [block(name, calibration_lines(camera, pair, by_rows)) for name, camera, pair in cameras]
+    yield from chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
+
+
+def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, str]:
+    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres."""
+    if rig.unit not in METRES:
+        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
+    rectified = rectify(rig, alpha)
+    if rectified is None:
+        raise InputError(
+            "ROS's files need images of one known size; put image_size into both files of points"
+        )
+    metres = rectified.P2.copy()
+    metres[:, 3] *= METRES[rig.unit]
+    sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
+    first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
+    return first, second
+
+
+def _stereo_lines(rig: StereoRig, rectified: Rectification | None) -> Iterator[str]:
+    yield f"format: {STEREO_FORMAT}"
+    yield from _POSE.lines(rig)
+    if rectified is not None:
+        yield from block("rectification", _RECTIFICATION.lines(rectified))
+    yield from _REST.lines(rig)
+
+
+def _estimates(rig: StereoRig) -> list[tuple[str, tuple[float, float]]]:
+    values = zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True)
+    return [(name, (value, rig.std[name])) for name, value in values]
+
+
+def read_stereo_rig(path: str | Path) -> StereoRig:
+    """Read a rig file that neurocal wrote; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is not YAML, or a key is missing or wrong.
+    """
+    return stereo_from_field(read_tree(path))
+
+
+def stereo_from_field(root: Field) -> StereoRig:
+    """Read a rig; see `read_stereo_rig`."""
+    if "stereo" not in root:
+        if "neurocal" in root:
+            root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
+        root.refuse(
+            "is not a rig of neurocal; give a file that neurocal stereo wrote, or make one of another "
+            "program's rig with neurocal convert --to neurocal"
+        )
+    block = root["stereo"]
+    if block["format"].integer() != STEREO_FORMAT:
+        root.refuse(f"stereo.format is {block['format'].integer()}, not {STEREO_FORMAT}; update neurocal")
+    left, right = calibration_from_field(root["left"]), calibration_from_field(root["right"])
+    if left.unit != right.unit:
+        root.refuse("left and right have different units; correct one")
+    if (unit := block["unit"].text()) != left.unit:
+        root.refuse(f"stereo.unit is {unit}, but left and right are in {left.unit}; correct the one edited")
+    try:
+        pose = Pose(block["R"].array(3, 3), block["t"].array(3))
+    except InputError as error:
+        raise FormatError(f"stereo: {error}; correct it", root.source) from error
+    found = _POSE.read(block)
+    stated = {**found["rotation"], **found["translation"]}
+    delay = found["delay"] or {"timed": False}
+    rig = StereoRig(
+        left,
+        right,
+        pose,
+        {name: std for name, (_, std) in stated.items()} | {"baseline": found["baseline_std"]},
+        found["covariance"]["data"].array(6, 6, unknown=True),
+        delay=(delay["value"], delay["std"]) if "value" in delay else None,
+        timed=delay["timed"],
+        **_REST.read(block),
+        **{key: found[key] for key in ("rmse_px", "max_px", "converged", "stop_reason", "iterations")},
+    )
+    _check_consistent(rig, block, found, [value for value, _ in stated.values()])
+    return rig
+
+
+def _check_consistent(rig: StereoRig, block: Field, matrices: Mapping[str, Any], values: list[float]) -> None:
+    """Refuse a file with contradicting values, of which one was edited."""
+    stated = (
+        ("E", matrices["E"], rig.E),
+        ("F", matrices["F"], rig.F),
+        ("baseline", np.array([matrices["baseline"]]), np.array([rig.baseline])),
+        ("rotation", euler_to_rotation(*values[:3]), rig.R),
+        ("translation", np.array(values[3:]), rig.t),
+    )
+    for name, found, expected in stated:
+        if np.abs(found - expected).max() > _SAME * np.abs(expected).max():
+            block.refuse(
+                f"stereo.{name} and stereo.R, stereo.t or the cameras disagree; correct the one edited"
+            )
+
+
+RIG_FORMAT = 1  # of the block rig; to be raised if older readers cannot read a change
 _STD = record(dict, Keys(", ".join(f"{name}: measure" for name in (*POSE_NAMES, "baseline"))), inline=True)
 _POSES = named(record(dict, Keys("R: 3x3, t: 3, std: std", {"std": _STD}), inline=True))
 _EDGE = Keys("cameras: sentences, views: integer, baseline: number, baseline_std: measure")
@@ -59,7 +204,7 @@ def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> s
         block("cameras", (line for part in parts for line in part.split("\n"))),
         _POSES.lines("poses", {name: _pose(rig, name) for name in rig.poses}, False),
         list_lines("edges", (_EDGE.flow(_edge(rig, *pair)) for pair in rig.edges)),
-        block("rig", [f"format: {FORMAT}", *_RIG.lines(rig)]),
+        block("rig", [f"format: {RIG_FORMAT}", *_RIG.lines(rig)]),
     )
     return "\n".join([*HEADER, *lines, ""])
 
@@ -102,8 +247,8 @@ def rig_from_field(root: Field) -> Rig:
             root["cameras"].fail("two cameras, as there are left and right")
         return of_two(stereo_from_field(root), *names)
     own = root["rig"]
-    if own["format"].integer() != FORMAT:
-        root.refuse(f"rig.format is {own['format'].integer()}, not {FORMAT}; update neurocal")
+    if own["format"].integer() != RIG_FORMAT:
+        root.refuse(f"rig.format is {own['format'].integer()}, not {RIG_FORMAT}; update neurocal")
     cameras = {name: calibration_from_field(one) for name, one in root["cameras"].entries().items()}
     if len(cameras) < 2:
         root["cameras"].fail("two cameras or more")

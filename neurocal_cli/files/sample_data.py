@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
-from neurocal_cli.errors import NeurocalError
-from neurocal_cli.files.failures import one_line
+from neurocal_cli.errors import NeurocalError, one_line
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import make_folder, write_whole
 

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.failures import one_line, source_of
+from neurocal_cli.errors import FormatError, InputError, one_line, source_of
 from neurocal_cli.files.reading import decode, read_blocks, read_bytes
 from neurocal_cli.files.table_header import (
     Layout,

@@ -12,8 +12,7 @@ from typing import Any
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import UNDISTORTED
-from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.failures import one_line, value_failures
+from neurocal_cli.errors import FormatError, InputError, one_line, value_failures
 from neurocal_cli.files.tree_fields import is_number
 from neurocal_cli.observations.distances import Distance
 

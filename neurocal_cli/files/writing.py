@@ -26,8 +26,7 @@ from functools import cache
 from pathlib import Path
 from typing import IO
 
-from neurocal_cli.errors import InputError, NeurocalError, UsageError
-from neurocal_cli.files.failures import one_line, reason
+from neurocal_cli.errors import InputError, NeurocalError, UsageError, one_line, reason
 
 # Opening these would truncate a file that the shell appends to, so they are written like stdout.
 STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})

@@ -12,7 +12,7 @@ from neurocal_cli import Calibration, Camera, Correspondences, Intrinsics, Pose,
 from neurocal_cli.commands.show.camera_report import calibration_json
 from neurocal_cli.commands.streams import for_json
 from neurocal_cli.files import calibration_yaml
-from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import read_calibration
 from neurocal_cli.files.result_files import write_calibration
 
 CAMERA = Camera(Intrinsics(1000.0, 1000.0, 960.0, 540.0), image_size=(1920, 1080))

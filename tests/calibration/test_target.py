@@ -23,11 +23,10 @@ from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.board_yaml import format_board, parse_board
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.points_csv import read_points
 from neurocal_cli.files.result_files import write_calibration
-from neurocal_cli.files.stereo_yaml import read_stereo_rig
+from neurocal_cli.files.rig_yaml import read_stereo_rig
 from neurocal_cli.observations.board import Plane, planes_of
 from neurocal_cli.observations.target import board_of
 
@@ -213,7 +212,7 @@ def test_real_pairs_of_one_board(kind: str, tmp_path: Path, real_files: RealFile
         points = tmp_path / "left.csv", tmp_path / "right.csv"
         result = run("stereo", *points, "--target", target, "--no-skew", "-o", tmp_path / "rig.yaml")
         assert result.exit_code == 0, result.stderr
-        from neurocal_cli.files.stereo_yaml import read_stereo_rig
+        from neurocal_cli.files.rig_yaml import read_stereo_rig
 
         rig = read_stereo_rig(tmp_path / "rig.yaml")
         rms[target], baseline[target] = rig.rmse_px, rig.baseline

@@ -25,7 +25,7 @@ from neurocal_cli.commands.batch_drift import Pair, compare
 from neurocal_cli.commands.batch_jobs import Job, Outcome
 from neurocal_cli.commands.batch_rows import drift_text, fleet_rows, of_one_kind
 from neurocal_cli.commands.show.fleet_page import fleet_page
-from neurocal_cli.files.job_files import publish, work_folder
+from neurocal_cli.files.batch_files import publish, work_folder
 
 QUICK = ("--set", "distortion=none", "--set", "target=given", "--set", "outliers=keep")
 BOARD = ("--set", "cols=9", "--set", "rows=6", "--set", "square=25")

@@ -11,7 +11,7 @@ from support.command_line import run
 from support.places import SAMPLES
 
 from neurocal_cli import Pose
-from neurocal_cli.files.stereo_yaml import format_stereo_rig, read_stereo_rig
+from neurocal_cli.files.rig_yaml import format_stereo_rig, read_stereo_rig
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,7 @@ from support.zoom_laws import FLOOR, between, grid, seen
 from neurocal_cli.calibration.zoom.fit import fit_lens
 from neurocal_cli.calibration.zoom.zoom_lens import camera_at
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.lens_points import read_lens_data, read_lens_points, write_lens_points
 from neurocal_cli.files.lens_yaml import format_lens, read_lens, write_lens
 

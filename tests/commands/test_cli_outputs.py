@@ -177,7 +177,7 @@ def test_a_failure_at_the_end_leaves_the_other_outputs_as_they_were(
     def fail(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("neurocal_cli.files.stereo_yaml.format_stereo_rig", fail)
+    monkeypatch.setattr("neurocal_cli.files.rig_yaml.format_stereo_rig", fail)
     quick = ("--no-skew", "--distortion", "none", "--outliers", "keep")
     result = run("stereo", left, right, *quick, "-o", rig, "--ros", ros, tmp_path / "right.yaml")
     assert result.exit_code == 1

@@ -15,7 +15,7 @@ from support.rigs import random_rig
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points, write_rig
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.neurocal import as_stereo
-from neurocal_cli.files.stereo_yaml import read_stereo_rig
+from neurocal_cli.files.rig_yaml import read_stereo_rig
 
 POINTS = np.random.default_rng(2).uniform([-1, -0.8, 3], [1, 0.8, 6], (50, 3))
 

@@ -20,7 +20,7 @@ from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.result_files import write_rig
-from neurocal_cli.files.stereo_yaml import read_stereo_rig
+from neurocal_cli.files.rig_yaml import read_stereo_rig
 from neurocal_cli.files.table import stream_table
 from neurocal_cli.files.table_header import Schema
 

@@ -17,8 +17,7 @@ from support.made_calibration import made_calibration
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, ViewResult
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.calibration_yaml import calibration_lines, format_calibration
+from neurocal_cli.files.calibration_yaml import calibration_lines, format_calibration, read_calibration
 from neurocal_cli.files.result_files import write_calibration
 from neurocal_cli.files.yaml_text import number, parse_yaml, quoted, text
 from neurocal_cli.observations.points import Correspondences
@@ -189,7 +188,7 @@ def test_a_calibration_comes_back_to_the_last_bit(tmp_path_factory, cal):
 def all_files_are_long():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("neurocal_cli.files.calibration_yaml._MOST_POINTS", 0)
-        patch.setattr("neurocal_cli.files.text_columns.LONGEST", 2)
+        patch.setattr("neurocal_cli.files.key_tables.LONGEST", 2)
         patch.setattr("neurocal_cli.files.observations_yaml.LONGEST", 2)
         yield
 

@@ -13,7 +13,7 @@ from support.made_calibration import made_calibration
 from support.real_data import RealFiles
 
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.calibration_tree import read_extrinsics
+from neurocal_cli.files.calibration_yaml import read_extrinsics
 from neurocal_cli.files.exchange.reading import read_intrinsics
 from neurocal_cli.files.result_files import write_calibration
 

@@ -12,7 +12,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import euler_to_rotation
 from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.multiview import multiview_entries
+from neurocal_cli.files.exchange.dictionary import multiview_entries
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
 
 LENSES = {

@@ -13,7 +13,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.dlt import coefficients
+from neurocal_cli.files.exchange.capture import dlt_coefficients
 from neurocal_cli.files.result_files import write_result
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"
@@ -61,11 +61,11 @@ def test_what_has_no_coefficients_is_refused(tmp_path: Path) -> None:
     assert "DLT has no distortion model fisheye" in refused.stderr
     assert run("convert", str(SAMPLES / "flat.csv"), "--to", "dlt").exit_code == 1
     with pytest.raises(InputError, match="hold a pose"):
-        coefficients(CameraSet((Camera(Intrinsics(800.0, 800.0, 320.0, 240.0)),)))
+        dlt_coefficients(CameraSet((Camera(Intrinsics(800.0, 800.0, 320.0, 240.0)),)))
 
 
 @pytest.mark.parametrize("depth", [0.0, 1e-12])
 def test_an_origin_beside_the_camera_has_no_coefficients(depth: float) -> None:
     pose = Pose(np.eye(3), np.array([100.0, 0.0, depth]))
     with pytest.raises(InputError, match="plane of the camera"):
-        coefficients(CameraSet((Camera(Intrinsics(800.0, 800.0, 320.0, 240.0)),), poses={"a": pose}))
+        dlt_coefficients(CameraSet((Camera(Intrinsics(800.0, 800.0, 320.0, 240.0)),), poses={"a": pose}))

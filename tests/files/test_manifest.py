@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
-from neurocal_cli.files.job_files import locked, publish, read_record, work_folder
-from neurocal_cli.files.manifest import read_data_sets
+from neurocal_cli.files.batch_files import locked, publish, read_data_sets, read_record, work_folder
 
 
 def test_a_manifest_names_its_columns_and_leaves_empty_cells_out(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_result
-from neurocal_cli.files.stereo_yaml import format_stereo_rig
+from neurocal_cli.files.rig_yaml import format_stereo_rig
 from neurocal_cli.files.yaml_text import parse_yaml
 
 

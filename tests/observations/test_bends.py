@@ -24,8 +24,7 @@ from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.commands.show.camera_report import calibration_report
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.result_files import write_calibration
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.points import Correspondences

@@ -1,4 +1,13 @@
-"""Formats of calibration programs and motion capture: anipose, BoofCV, multical, calib.io and EasyMocap."""
+"""Formats of motion capture: anipose, caliscope, EasyMocap, and the coefficients of a DLT.
+
+The eleven coefficients of the direct linear transformation (Abdel-Aziz and Karara 1971) are
+
+    u = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1),    v = (L5 X + ... + L8) / (the same)
+
+They are the entries of P = A [R | t], equation (1), divided by the last. A file has eleven rows and no
+header, as programs for motion capture expect. Each camera of a rig is a column, with X, Y, Z as the target
+lies in the first view; of a single camera, each view is one.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +15,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import matrix_data
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, find, numbers
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, numbers, toml_text
 from neurocal_cli.files.exchange.camera_set import (
     CameraSet,
     Format,
     after,
     from_vector,
-    inverse,
     mounted,
     to_vector,
 )
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.tree_texts import toml_text, under
 from neurocal_cli.files.tree_fields import Field
 
 # anipose, freemocap and caliscope: TOML with a section for each camera, posed from the world to the camera.
@@ -123,137 +129,6 @@ CALISCOPE = Format(
     rig="`rotation, translation` [m] from the world to each camera",
 )
 
-# BoofCV, also its stereo rigs: ``rightToLeft`` maps the right camera's frame to the left one's.
-_R = "radial_tangential/"
-_BOOFCV_ENTRIES = under("pinhole/", "fx", "fy", "cx", "cy")
-_BOOFCV_FIVE = under(_R, "radial/0", "radial/1", "t1", "t2", "radial/2")
-_BOOFCV = CameraKeys(
-    "BoofCV",
-    _BOOFCV_ENTRIES,
-    (
-        Lens(("pinhole_radial_tangential", "pinhole", ""), "plumb_bob", _BOOFCV_FIVE),
-        Lens(("omnidirectional_universal",), "omnidir", ("mirror_offset", *_BOOFCV_FIVE[:4])),
-    ),
-    model="model",
-    size=("pinhole/width", "pinhole/height"),
-    skew="pinhole/skew",
-)
-
-
-def _boofcv_camera(root: Field, name: str = "camera") -> Camera:
-    model = root.get("model", "").text()
-    omni = model == "omnidirectional_universal"
-    if ("mirror_offset" in root) != omni:
-        raise InputError(
-            f"BoofCV's model {model[:40] or 'with a mirror_offset'!r} is not known; calibrate with "
-            "pinhole_radial_tangential or omnidirectional_universal, or from the points"
-        )
-    if "skew" not in root["pinhole"]:
-        root["pinhole"]["skew"].number()
-    radial = find(root, f"{_R}radial")
-    if radial is not None and (k := radial.array(-1)).size > 2:
-        if k.size > 3:
-            radial.fail("3 numbers at most")
-        if omni and k[2]:
-            raise InputError("a third radial coefficient of an omnidirectional camera is not known; use two")
-    return _BOOFCV.camera(root, name)
-
-
-def _read_boofcv(document: Document) -> CameraSet:
-    root = document.root
-    if "pinhole" in root:
-        return CameraSet((_boofcv_camera(root),), program="BoofCV")
-    back = root["rightToLeft"]
-    pose = Pose(numbers(back["rotation"], 9).reshape(3, 3), np.array([back[key].number() for key in "xyz"]))
-    cameras = [_boofcv_camera(root[side], side) for side in ("left", "right")]
-    return mounted(cameras, [Pose(np.eye(3), np.zeros(3)), inverse(pose)], "BoofCV", None)
-
-
-BOOFCV = Format(
-    "BoofCV",
-    _BOOFCV.models,
-    matches=lambda document: "pinhole" in document.tree or "rightToLeft" in document.tree,
-    read=_read_boofcv,
-    files="intrinsic.yaml, stereo.yaml",
-    skew=True,
-    rig="`rightToLeft`",
-)
-
-# multical: the pose called a_to_b maps the frame of b to that of a.
-_MULTICAL = CameraKeys(
-    "multical",
-    ("K:matrix",),
-    (Lens(("standard",), "tilted", ("dist",)), Lens(("fisheye",), "fisheye", ("dist",))),
-    model="model",
-    size=("image_size",),
-)
-
-
-def _read_multical(document: Document) -> CameraSet:
-    cameras = {
-        name: _MULTICAL.camera(part, name) for name, part in document.root["cameras"].entries().items()
-    }
-    poses: dict[str, Pose] = {}
-    stated = document.root["camera_poses"].entries()
-    for _ in stated:
-        for name, entry in stated.items():
-            own, _, other = name.partition("_to_")
-            pose = Pose(entry["R"].array(3, 3), numbers(entry["T"], 3))
-            if not other or other in poses:
-                poses[own] = after(pose, poses[other]) if other else pose
-    return mounted(list(cameras.values()), [poses.get(name) for name in cameras], "multical", "m")
-
-
-MULTICAL = Format(
-    "multical",
-    _MULTICAL.models,
-    matches=lambda document: {"cameras", "camera_poses"} <= set(document.tree),
-    read=_read_multical,
-    files="calibration.json",
-    most_cameras=99,
-    rig="`camera_poses`, `a_to_b` from b to a",
-)
-
-# Calibrator of calib.io.
-_CALIB_IO = CameraKeys(
-    "calib.io",
-    ("f/val", "fy", "cx/val", "cy/val"),
-    (Lens(("libCalib::CameraModelOpenCV",), "tilted", tuple(f"{name}/val" for name in MODELS["tilted"])),),
-    model="model",
-    size=("imageSize/width", "imageSize/height"),
-)
-
-
-def _read_calib_io(document: Document) -> CameraSet:
-    cameras, poses = [], []
-    for k, one in enumerate(document.root["Calibration"]["cameras"].items()):
-        model = one["model"]
-        data = model["ptr_wrapper"]["data"]
-        parameters = data["parameters"]
-        fy = parameters["f"]["val"].number() * parameters["ar"]["val"].number()
-        size = data["CameraModelCRT"]["CameraModelBase"]["imageSize"].value
-        word = model.get("polymorphic_name", "libCalib::CameraModelOpenCV").text()
-        tree = {**parameters.value, "fy": fy, "imageSize": size, "model": word}
-        cameras.append(_CALIB_IO.camera(Field(tree, data.source, data.path), f"cam{k}"))
-        pose = None
-        if "transform" in one:
-            r, t = ([one["transform"][part][axis].number() for axis in axes]
-                    for part, axes in (("rotation", ("rx", "ry", "rz")), ("translation", "xyz")))  # fmt: skip
-            pose = Pose(from_vector(np.array(r)), np.array(t))
-        poses.append(pose)
-    return mounted(cameras, poses if len(poses) > 1 else [None], "calib.io", None)
-
-
-CALIB_IO = Format(
-    "calib.io",
-    _CALIB_IO.models,
-    matches=lambda document: "Calibration" in document.tree and "libCalib" in document.text[:100_000],
-    read=_read_calib_io,
-    files="Calibrator's JSON",
-    most_cameras=99,
-    rig="`transform` from the first camera",
-)
-
 # EasyMocap: intri.yml with K and dist of each name, extri.yml with the poses, both from the world.
 
 
@@ -287,4 +162,46 @@ EASYMOCAP = Format(
     files="intri.yml and extri.yml",
     most_cameras=99,
     rig="`Rot_`, `T_` from the world to each camera",
+)
+
+
+_FAR = 1e-9  # share of P's third row; a smaller last entry is 0
+
+
+def dlt_coefficients(cameras: CameraSet) -> Array:
+    """(11, C) coefficients of each camera of a rig, or (11, V) of each view of one camera.
+
+    Raises InputError if there is no view, or if a camera's plane passes through the origin of X, Y, Z, where
+    the coefficients are infinite.
+    """
+    if not cameras.poses:
+        raise InputError(
+            "the coefficients of a DLT hold a pose, and the file has none; give a file with views, such as "
+            "neurocal calibrate writes"
+        )
+    views = list(cameras.poses.items())
+    if len(cameras.cameras) == 1:
+        placed = [(name, cameras.cameras[0], pose) for name, pose in views]
+    else:
+        pairs = zip(cameras.cameras, cameras.mounted, strict=True)
+        placed = [(camera.name, camera, after(mounted, views[0][1])) for camera, mounted in pairs]
+    found = []
+    for name, camera, pose in placed:
+        P = camera.A @ pose.D
+        if abs(P[2, 3]) <= _FAR * np.abs(P[2]).max():
+            raise InputError(
+                f"{name}: the origin of X, Y, Z lies in the plane of the camera, where the coefficients of a "
+                "DLT are infinite; move the origin of the target"
+            )
+        found.append(P.ravel()[:11] / P[2, 3])
+    return np.array(found).T
+
+
+def _dlt_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    rows = (",".join(map(repr, row)) for row in dlt_coefficients(cameras).tolist())
+    return {"": "\n".join([*rows, ""])}
+
+
+DLT = Format(
+    "DLT", ("none",), _dlt_text, files="11 rows, written only", skew=True, poses=True, most_cameras=99
 )

@@ -22,10 +22,9 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.yaml_text import number
 

@@ -22,13 +22,12 @@ import numpy as np
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError, InputError, value_failures
+from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_names import SHAPE, plain
 from neurocal_cli.files.exchange.document import array_of, arrays_of, camera_matrix, few_numbers
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
-from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.file_storage import parse_tree
 from neurocal_cli.files.points_csv import POINTS, read_points
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.table import read_table

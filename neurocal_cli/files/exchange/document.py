@@ -21,7 +21,7 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.file_storage import parse_tree
+from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.reading import decode, is_point_table, read_bytes
 from neurocal_cli.files.tree_fields import Field, is_number
 

@@ -20,7 +20,7 @@ from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import checked_size
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, one_line, value_failures
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
 from neurocal_cli.files.exchange.camera_names import (
     ALIKE,
@@ -48,20 +48,17 @@ from neurocal_cli.files.exchange.camera_names import (
     TANGENTIAL,
     UNKNOWN,
     WIDTH,
-    means,
-    plain,
-)
-from neurocal_cli.files.exchange.document import camera_matrix
-from neurocal_cli.files.exchange.loose_values import (
     flat,
     has_entries,
     is_four,
     is_matrix,
     is_numbers,
     matrix_of,
+    means,
     parameters_apart,
+    plain,
 )
-from neurocal_cli.files.failures import one_line, value_failures
+from neurocal_cli.files.exchange.document import camera_matrix
 from neurocal_cli.files.tree_fields import Field
 
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.

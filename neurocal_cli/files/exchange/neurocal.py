@@ -12,21 +12,19 @@ from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES
-from neurocal_cli.errors import InputError
-from neurocal_cli.files.calibration_tree import (
+from neurocal_cli.errors import InputError, value_failures
+from neurocal_cli.files.calibration_yaml import (
     calibration_from_field,
     covariance_from_field,
     distortion_from_field,
+    format_calibration,
     intrinsics_from_field,
     neurocal_block,
 )
-from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.rig_yaml import format_rig, rig_from_field
-from neurocal_cli.files.stereo_yaml import format_stereo_rig, stereo_from_field
+from neurocal_cli.files.rig_yaml import format_rig, format_stereo_rig, rig_from_field, stereo_from_field
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences
 

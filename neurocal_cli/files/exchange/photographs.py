@@ -10,7 +10,15 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, transform
+from neurocal_cli.files.exchange.camera_keys import (
+    FIVE,
+    K4,
+    RADTAN,
+    CameraKeys,
+    Lens,
+    json_text,
+    transform,
+)
 from neurocal_cli.files.exchange.camera_set import (
     CameraSet,
     Format,
@@ -18,12 +26,6 @@ from neurocal_cli.files.exchange.camera_set import (
     mounted,
 )
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.tree_texts import (
-    FIVE,
-    K4,
-    RADTAN,
-    json_text,
-)
 from neurocal_cli.files.tree_fields import Field
 
 # nerfstudio and instant-ngp; poses map the camera to the world, with x right, y up, z backwards.

@@ -8,31 +8,31 @@ from dataclasses import replace
 from pathlib import Path
 
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.presented import Converted
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.nearest_camera import with_model
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError, InputError, check_choice, source_of, value_failures
 from neurocal_cli.files.exchange import (
+    calibrators,
     capture,
     colmap,
     datasets,
     dictionary,
-    direct_odometry,
-    dlt,
-    kalibr,
     matlab,
-    mrcal,
+    nearest_lenses,
     neurocal,
     odometry,
-    openptv,
     photographs,
-    radial_curves,
     reconstruction,
     ros,
     sensors,
 )
+from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
-from neurocal_cli.files.failures import source_of, value_failures
+from neurocal_cli.files.exchange.neurocal import camera_set
 from neurocal_cli.files.tree_fields import Field
 
 # Formats that `convert` writes, by the values of its option ``--to``.
@@ -40,13 +40,13 @@ FORMATS: dict[str, Format] = {
     "neurocal": neurocal.FORMAT,
     "opencv": dictionary.OPENCV,
     "ros": ros.FORMAT,
-    "kalibr": kalibr.FORMAT,
+    "kalibr": calibrators.KALIBR,
     "colmap": colmap.FORMAT,
-    "mrcal": mrcal.FORMAT,
+    "mrcal": calibrators.MRCAL,
     "matlab": matlab.FORMAT,
     "json": dictionary.JSON,
     "npz": dictionary.NPZ,
-    "dlt": dlt.FORMAT,
+    "dlt": capture.DLT,
     "nerfstudio": photographs.NERFSTUDIO,
     "anipose": capture.ANIPOSE,
     "caliscope": capture.CALISCOPE,
@@ -62,14 +62,14 @@ FORMATS: dict[str, Format] = {
 # Formats that are read, the most specific first; the last takes any dictionary of a camera.
 READ: tuple[Format, ...] = (
     neurocal.FORMAT,
-    radial_curves.OCAM,
+    nearest_lenses.OCAM,
     matlab.FORMAT,
     colmap.FORMAT,
-    mrcal.FORMAT,
+    calibrators.MRCAL,
     capture.CALISCOPE,
     capture.ANIPOSE,
-    capture.MULTICAL,
-    capture.CALIB_IO,
+    calibrators.MULTICAL,
+    calibrators.CALIB_IO,
     capture.EASYMOCAP,
     sensors.ZED,
     sensors.OAK,
@@ -80,17 +80,17 @@ READ: tuple[Format, ...] = (
     datasets.MVSNET,
     datasets.KRTD,
     datasets.DROID,
-    openptv.FORMAT,
-    direct_odometry.DSO,
+    nearest_lenses.OPENPTV,
+    odometry.DSO,
     odometry.EUROC,
-    kalibr.FORMAT,
-    capture.BOOFCV,
+    calibrators.KALIBR,
+    calibrators.BOOFCV,
     odometry.ORB_SLAM,
     odometry.VINS,
     odometry.BASALT,
     odometry.OKVIS,
     odometry.SVO,
-    direct_odometry.VIKIT,
+    odometry.VIKIT,
     photographs.NERFSTUDIO,
     photographs.NERFIES,
     reconstruction.METASHAPE,
@@ -134,7 +134,7 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
     ),
     (
-        lambda d: openptv.numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
+        lambda d: nearest_lenses.numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
         "is the distortion of a camera of OpenPTV, in mm of the sensor; give its .ori, beside this file",
     ),
     (
@@ -315,3 +315,12 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
     (frame,) = common
     pose = after(right.poses[frame], inverse(left.poses[frame]))
     return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})
+
+
+def converted(
+    result: Calibration | StereoRig | Rig, to: str, model: str | None, force: bool, ending: str
+) -> Converted:
+    """Convert a result; see `Presented.convert`."""
+    check_choice("to", to, tuple(FORMATS))
+    adapted = adapt_cameras(replace(camera_set(result), unit=result.unit), FORMATS[to], force, model)
+    return Converted(FORMATS[to].text(adapted.cameras, ending), adapted.losses, adapted.remarks)

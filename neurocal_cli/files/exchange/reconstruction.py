@@ -10,11 +10,10 @@ from typing import Any
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
+from neurocal_cli.files.camera_tree import xml_root
+from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens, under
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.tree_texts import FIVE, K4, under
-from neurocal_cli.files.file_storage import xml_root
 from neurocal_cli.files.tree_fields import Field
 
 

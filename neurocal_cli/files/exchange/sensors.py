@@ -9,11 +9,10 @@ import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_vector, inverse, mounted
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.reconstruction import only
-from neurocal_cli.files.exchange.tree_texts import EIGHT, FIVE
 from neurocal_cli.files.tree_fields import Field
 
 _STILL = Pose(np.eye(3), np.zeros(3))

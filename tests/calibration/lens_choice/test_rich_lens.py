@@ -23,8 +23,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.rich_lens import REACHES
 from neurocal_cli.commands.show.camera_report import calibration_report
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.points_csv import read_points
 from neurocal_cli.observations.points import Correspondences
 

@@ -14,7 +14,7 @@ from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
-from neurocal_cli.files.stereo_yaml import format_ros_pair
+from neurocal_cli.files.rig_yaml import format_ros_pair
 from neurocal_cli.files.yaml_text import parse_yaml
 
 POSES = {

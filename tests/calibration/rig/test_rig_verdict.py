@@ -20,7 +20,7 @@ from neurocal_cli import calibrate, calibrate_stereo, fit_stereo, read_points, t
 from neurocal_cli.calibration.rig.assessment import assess_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
-from neurocal_cli.files.stereo_yaml import read_stereo_rig
+from neurocal_cli.files.rig_yaml import read_stereo_rig
 from neurocal_cli.observations.points import Correspondences
 
 

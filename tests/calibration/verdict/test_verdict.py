@@ -19,8 +19,7 @@ from support.wrong_inputs import flat
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.calibration.verdict.assessment import assess, gather_evidence
 from neurocal_cli.calibration.verdict.rules import reach_verdict
-from neurocal_cli.files.calibration_tree import read_calibration
-from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.result_files import write_calibration
 
 BENT = SAMPLES / "bent.csv"
