@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.board_yaml import read_board
     from neurocal_cli.files.calibration_yaml import read_calibration
     from neurocal_cli.files.images import read_image
-    from neurocal_cli.files.lens_points import read_lens_data, read_lens_points
-    from neurocal_cli.files.lens_yaml import read_lens, write_lens
+    from neurocal_cli.files.lens_files import read_lens, read_lens_data, read_lens_points, write_lens
     from neurocal_cli.files.points_csv import read_points, write_points
     from neurocal_cli.files.result_files import write_calibration, write_rig
     from neurocal_cli.files.rig_points import read_rig_points
@@ -97,9 +96,9 @@ _HOMES = {
     "read_calibration": "files.calibration_yaml",
     "read_rig": "files.rig_yaml",
     "read_image": "files.images",
-    "read_lens": "files.lens_yaml",
-    "read_lens_data": "files.lens_points",
-    "read_lens_points": "files.lens_points",
+    "read_lens": "files.lens_files",
+    "read_lens_data": "files.lens_files",
+    "read_lens_points": "files.lens_files",
     "read_points": "files.points_csv",
     "read_stereo_rig": "files.rig_yaml",
     "read_rig_points": "files.rig_points",
@@ -110,7 +109,7 @@ _HOMES = {
     "undistort_image": "camera.remapping",
     "undistort_points": "observations.undistorted_points",
     "write_calibration": "files.result_files",
-    "write_lens": "files.lens_yaml",
+    "write_lens": "files.lens_files",
     "write_points": "files.points_csv",
     "write_rig": "files.result_files",
 }

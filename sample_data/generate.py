@@ -13,7 +13,7 @@ from simulated_zoom import SimulatedZoom
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.files.lens_points import write_lens_points
+from neurocal_cli.files.lens_files import write_lens_points
 from neurocal_cli.files.points_csv import write_points
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences

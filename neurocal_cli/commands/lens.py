@@ -147,8 +147,7 @@ def fit(
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
     from neurocal_cli.commands.show.zoom_plots import draw_lens
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
-    from neurocal_cli.files.lens_points import read_lens_data
-    from neurocal_cli.files.lens_yaml import write_lens
+    from neurocal_cli.files.lens_files import read_lens_data, write_lens
 
     data = noted(read_lens_data, points)
     topologies = None if hidden is None else (hidden,)
@@ -213,7 +212,7 @@ def camera(
     options.check_camera_name(camera_name)
     preparation.check((lens_file,), (output,), as_json=as_json)
     from neurocal_cli.calibration.zoom.zoom_lens import camera_at
-    from neurocal_cli.files.lens_yaml import read_lens
+    from neurocal_cli.files.lens_files import read_lens
     from neurocal_cli.files.result_files import write_calibration
 
     learnt = read_lens(lens_file)
@@ -275,8 +274,7 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
     from neurocal_cli.calibration.zoom.judgement import judge_lens
     from neurocal_cli.commands.show.zoom_plots import draw_evaluation
     from neurocal_cli.commands.show.zoom_report import evaluation_json, evaluation_report
-    from neurocal_cli.files.lens_points import read_lens_points
-    from neurocal_cli.files.lens_yaml import read_lens
+    from neurocal_cli.files.lens_files import read_lens, read_lens_points
 
     learnt = read_lens(lens_file)
     data = noted(read_lens_points, points)
@@ -295,7 +293,7 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
 def _judge(lens_file: str, as_json: bool) -> None:
     """Show a lens with its verdict, as `fit` does."""
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
-    from neurocal_cli.files.lens_yaml import read_lens
+    from neurocal_cli.files.lens_files import read_lens
 
     learnt = read_lens(lens_file)
     answer(as_json, lambda: lens_json(learnt), lambda: lens_report(learnt))

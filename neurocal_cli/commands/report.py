@@ -81,7 +81,7 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
 
     result: Result
     if "neurocal_lens" in root:
-        from neurocal_cli.files.lens_yaml import lens_from_field
+        from neurocal_cli.files.lens_files import lens_from_field
 
         result, block, cameras, none = lens_from_field(root), None, [], "a zoom lens"
     elif "stereo" in root:

@@ -18,8 +18,14 @@ from neurocal_cli.calibration.zoom.fit import fit_lens
 from neurocal_cli.calibration.zoom.zoom_lens import camera_at
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
-from neurocal_cli.files.lens_points import read_lens_data, read_lens_points, write_lens_points
-from neurocal_cli.files.lens_yaml import format_lens, read_lens, write_lens
+from neurocal_cli.files.lens_files import (
+    format_lens,
+    read_lens,
+    read_lens_data,
+    read_lens_points,
+    write_lens,
+    write_lens_points,
+)
 
 CAMERAS = "zoom,alpha_u,alpha_v,u0,v0\n" + "".join(
     f"{z},{100 * z + 3 * (z % 7)},{100 * z},640,{480 + 0.1 * (z % 3)}\n" for z in range(20, 70, 5)

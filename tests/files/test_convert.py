@@ -29,8 +29,7 @@ from neurocal_cli import (
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.camera_set import CameraSet, adapt_cameras
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 SIZE = (640, 480)

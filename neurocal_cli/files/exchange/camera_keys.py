@@ -23,6 +23,7 @@ from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
+from neurocal_cli.files.exchange.camera_names import matrix_of
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.tree_fields import Field
@@ -71,9 +72,9 @@ class CameraKeys:
             entries = numbers(values[0])
             if len(entries) not in (4, 9):
                 values[0].fail("four numbers or a 3 x 3 matrix")
-            K = _matrix(*entries) if len(entries) == 4 else entries.reshape(3, 3).copy()
+            K = matrix_of(*entries) if len(entries) == 4 else entries.reshape(3, 3).copy()
         else:
-            K = _matrix(*(value.number() for value in values))
+            K = matrix_of(*(value.number() for value in values))
         if self.skew and (skew := find(root, self.skew)) is not None:
             K[0, 1] = skew.number()
         K[:2, 2] -= self.first_pixel
@@ -169,7 +170,7 @@ class CameraKeys:
             _put_all(tree, self.size, camera.image_size or (0, 0))
         paths = lens.intrinsics or self.intrinsics
         if paths[0].endswith((":matrix", ":data")):
-            put(tree, paths[0], _matrix(a, b, u0, v0, skew))
+            put(tree, paths[0], matrix_of(a, b, u0, v0, skew))
         else:
             _put_all(tree, paths, [a, b, u0, v0])
         if self.skew:
@@ -184,10 +185,6 @@ def _put_all(tree: dict[str, Any], paths: tuple[str, ...], values: Any) -> None:
     else:
         for path, value in zip(paths, values, strict=True):
             put(tree, path, value)
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:
-    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _plain(word: str) -> str:

@@ -29,8 +29,7 @@ from neurocal_cli.files.exchange import (
     ros,
     sensors,
 )
-from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, adapt_cameras, after, inverse
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.exchange.neurocal import camera_set
 from neurocal_cli.files.tree_fields import Field

@@ -15,7 +15,7 @@ from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.calibration.zoom.target import lens_target, on_target
 from neurocal_cli.calibration.zoom.zoom_lens import with_target_uncertain
 from neurocal_cli.camera.geometry import rotation_step
-from neurocal_cli.files.lens_yaml import read_lens, write_lens
+from neurocal_cli.files.lens_files import read_lens, write_lens
 
 SIGMA = 0.1
 ZOOMS = np.linspace(0, 1000, 6)
