@@ -22,6 +22,7 @@ from neurocal_cli.adjustment.board.information import (
     information_of,
     of_views,
     steps_of_poses,
+    without_points,
 )
 from neurocal_cli.adjustment.board.posterior import (
     OUT_OF_PLANE,
@@ -261,14 +262,15 @@ class Search:
         for step in range(_STEPS):
             # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
-            folded = folded_information(
-                self.sights(), len(self.given), folds if known and not self.still else one_fold
-            )
-            here = folded.whole.turned(self.prior.axes)
+            if self.still:
+                here = self._of_held_points()
+            else:
+                folded = folded_information(self.sights(), len(self.given), folds if known else one_fold)
+                here = folded.whole.turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
             if self.surface is not None:
                 self.precision = most_probable_precision(here, self.prior.size)
-            info = here.around_given(self.offsets)
+            info = here if self.still else here.around_given(self.offsets)
             info = info if self.surface is None else info.held(self.precision)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
@@ -348,8 +350,16 @@ class Search:
         if self.surface is None:
             opened = cache(found.opened)
             return lambda variance: opened()
-        info = self._in_offsets(information_of(self.sights(), len(self.given)))
+        if self.still:
+            info = self._of_held_points()
+        else:
+            info = self._in_offsets(information_of(self.sights(), len(self.given)))
         return partial(posterior_of, target, info, self.prior)
+
+    def _of_held_points(self) -> Information:
+        """The quadratic of the only camera with its bends, without the points: they stay as given."""
+        (sight,) = self.sights()
+        return of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
 
     def _in_offsets(self, info: Information) -> Information:
         """The quadratic around the current target, in the whole offsets along each point's axes."""
@@ -371,7 +381,7 @@ class Search:
         """Move the target, and return the cameras' predicted states in pixels; None if it moves too far."""
         if not np.abs(found.offsets).max() < self.largest:
             return None
-        own = steps_of_poses(info, found.camera_step, found.offsets)
+        own = steps_of_poses(info, found.camera_step, found.offsets[: len(info.point)])
         if self.surface is not None:
             self.bends = own[:, 6:]
             bent = self.surface.offsets(self._common()) @ self.bends.T

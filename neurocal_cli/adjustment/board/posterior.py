@@ -214,7 +214,7 @@ def given_posterior(info: Information, prior: Prior) -> Posterior:
     cost -= float(g @ inverse @ g)
     logdet += float(np.linalg.slogdet(S)[1]) - info.log_precision
     return Posterior(
-        offsets=np.zeros((len(info.point), 3)),
+        offsets=np.zeros((len(prior.axes), 3)),
         variance=cost / info.spare,
         camera_step=inverse @ g,
         camera=np.asarray(inverse, dtype=float),
