@@ -33,9 +33,10 @@ def correlation(views: Views, errors: Array) -> float:
     low = np.minimum.reduceat(views.pixels, views.first)
     extent = np.maximum.reduceat(views.pixels, views.first) - low
     strips = np.maximum(np.sqrt(np.bincount(group, minlength=n_groups)), 1.0)[group]
-    height = np.maximum(extent[:, 1], 1e-300)[views.index] / strips
-    strip = np.floor((views.pixels[:, 1] - low[views.index, 1]) / height)
-    order = np.lexsort((views.pixels[:, 0], strip, group))
+    along, down = ((views.pixels - low[views.index]) / np.maximum(extent, 1e-300)[views.index]).T
+    strip = np.floor(down * strips)
+    # One number sorts by group, strip and u: three sorts take three times as long.
+    order = np.argsort(2 * (group * (strips.max() + 2) + strip) + along, kind="stable")
     one, two = order[:-1], order[1:]
     same = (group[one] == group[two]) & (strip[one] == strip[two])
     one, two = one[same], two[same]
