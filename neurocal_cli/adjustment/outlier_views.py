@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan
+from neurocal_cli.adjustment.cross_validation import Quadratics, inverse_or_nan, reduced
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE
 from neurocal_cli.adjustment.solution import Solution

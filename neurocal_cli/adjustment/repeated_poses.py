@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import folds_of
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -24,6 +23,11 @@ from neurocal_cli.camera.state import CameraState
 _STILL = 1.0  # px by which the target's points may move, or
 _NOISE = 3.0  # this many standard deviations of their noise, if that is more
 _ROWS = 100  # rows of the distance matrix computed at a time: they stay in the cache
+
+
+def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
+    """(G,) fold of each group, assigned in turn; with at most `n_folds` groups each is a fold of its own."""
+    return np.arange(n_groups) % n_folds if n_groups > n_folds else np.arange(n_groups)
 
 
 @frozen_dataclass(eq=False)

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.open_coefficients import open_at_points
+from neurocal_cli.adjustment.open_choices import open_at_points
 from neurocal_cli.calibration.calibration import Calibration, free_entries
 from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
 from neurocal_cli.camera.camera import Camera
@@ -92,7 +92,7 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
 class _Known:
     """Information on a camera from the views taken so far."""
 
-    camera: Camera  # with open coefficients that its model lacks (`open_coefficients`), as 0
+    camera: Camera  # with open coefficients that its model lacks (`open_choices`), as 0
     free: NDArray[np.bool_]  # (5 + K,) entries of A and coefficients that were estimated, or are open
     information: Array  # (f, f) normal matrix of the free parameters, with the prior of the open coefficients
     places: Array  # (g, 2, f) derivatives of the judged pixels, see `pixel_changes`

@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.camera.camera import Camera, camera_of
-from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, StraightLines, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.late_import import late
+from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, ProjectedPoints
 from neurocal_cli.camera.opencv_names import camera_info, opencv_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
-from neurocal_cli.camera.plane_points import PlaneErrors, PlanePoints
-from neurocal_cli.camera.projected_points import ProjectedPoints
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError

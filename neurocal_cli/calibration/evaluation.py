@@ -20,7 +20,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.laid_points import laid
+from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
 # In the same image, most points lie within these distances of the calibration's prediction, even after small

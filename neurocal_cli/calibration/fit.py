@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from neurocal_cli.adjustment.common_noise import reweighted
-from neurocal_cli.adjustment.leave_out import quietly
+from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
@@ -125,7 +125,7 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
 def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
     """Adjust the wanted model from its lenses that are most similar to a simpler one; the best result."""
     from neurocal_cli.calibration.lens_choice.xi_profile import with_xi_held_if_flat
-    from neurocal_cli.camera.similar_lens import similar_states, tilted_states
+    from neurocal_cli.camera.nearest_camera import similar_states, tilted_states
 
     state, views = simpler.state, problem.views
     starts = similar_states(state, problem.distortion.model, farthest_angle(views, state))

@@ -15,10 +15,9 @@ from neurocal_cli.calibration.verdict.assessment import (
     position_covariance_of,
 )
 from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
-from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
-from neurocal_cli.camera.plane_points import PlaneErrors, PlanePoints, Spread
+from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, Spread
 from neurocal_cli.errors import InputError
 
 _STEEPEST = np.cos(np.radians(75.0))  # of the rays of a wide lens that are judged

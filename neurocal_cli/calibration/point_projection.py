@@ -8,7 +8,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.assessment import pixel_covariance_of
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
-from neurocal_cli.camera.projected_points import ProjectedPoints
+from neurocal_cli.camera.measured import ProjectedPoints
 from neurocal_cli.errors import InputError
 
 

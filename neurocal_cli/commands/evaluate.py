@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import Method
-    from neurocal_cli.camera.plane_points import PlaneErrors
+    from neurocal_cli.camera.measured import PlaneErrors
     from neurocal_cli.observations.points import Correspondences
 
 

@@ -18,7 +18,7 @@ from neurocal_cli.files.writing import write_chunks
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neurocal_cli.camera.plane_points import PlanePoints
+    from neurocal_cli.camera.measured import PlanePoints
 
 
 def points_on_plane(

@@ -70,7 +70,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
     if described is None:
         board = board_of(*known)
     else:
-        from neurocal_cli.observations.found_planes import with_found_points
+        from neurocal_cli.observations.estimated_board import with_found_points
 
         board = with_found_points(described, *known)
     if not preparation.is_for_the_eye(output, "board.yaml"):

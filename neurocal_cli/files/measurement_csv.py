@@ -14,7 +14,7 @@ from neurocal_cli.calibration.rig.many_views import SpacePoints
 from neurocal_cli.calibration.rig.triangulation import Triangulated
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.plane_points import PlanePoints
+from neurocal_cli.camera.measured import PlanePoints
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.reading import read_blocks
 from neurocal_cli.files.table import read_table, stream_table

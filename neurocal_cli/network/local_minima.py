@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
-from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.leave_out import solve_or_nan
+from neurocal_cli.adjustment.cross_validation import reduced, solve_or_nan
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import squared_errors
 from neurocal_cli.camera.geometry import Array

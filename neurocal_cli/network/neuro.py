@@ -49,7 +49,7 @@ from neurocal_cli.network.view_networks import (
 )
 
 if TYPE_CHECKING:
-    from neurocal_cli.network.random_cameras import Found
+    from neurocal_cli.network.starts import Found
 
 
 # Repeated by test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
@@ -225,7 +225,7 @@ def _refined(
 
 def _random_camera(problem: Problem, rng: np.random.Generator, starts: int) -> Found | None:
     """Intrinsics and pose of a single view from random cameras."""
-    from neurocal_cli.network.random_cameras import find_camera
+    from neurocal_cli.network.starts import find_camera
 
     return find_camera(problem.views, problem.normalised_entries, problem.free, rng, starts)
 
@@ -242,7 +242,7 @@ def _with_random_poses(
     members = np.flatnonzero(which)
     if not members.size:
         return state, record
-    from neurocal_cli.network.random_cameras import find_poses
+    from neurocal_cli.network.starts import find_poses
 
     found = find_poses(views, members, state.entries, rng, starts)
     R, t = state.R.copy(), state.t.copy()

@@ -9,7 +9,7 @@ from support.distorted import bent_set, through
 from support.scenes import random_flat_set
 
 from neurocal_cli import calibrate
-from neurocal_cli.adjustment.open_coefficients import OpenPrior, spread_of_open
+from neurocal_cli.adjustment.open_choices import OpenPrior, spread_of_open
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 

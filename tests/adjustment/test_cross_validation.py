@@ -8,8 +8,14 @@ from support.scenes import Scene, pinhole, random_flat_set, random_solid
 from support.slow_cases import slow_but
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
-from neurocal_cli.adjustment.cross_validation import Minimum, disagreement, held_out, held_out_points, reduced
-from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.cross_validation import (
+    Minimum,
+    disagreement,
+    held_out,
+    held_out_points,
+    inverse_or_nan,
+    reduced,
+)
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.observations.points import Correspondences

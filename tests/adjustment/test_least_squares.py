@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
+from neurocal_cli.adjustment.cross_validation import Quadratics, inverse_or_nan, solve_or_nan
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop, minimise
 from neurocal_cli.adjustment.normal_equations import (
     ROUNDING,
@@ -19,6 +19,7 @@ from neurocal_cli.adjustment.normal_equations import (
     inverse_scaled,
     solve_scaled,
 )
+from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.camera.geometry import Array
 
 Residuals = Callable[[Array], tuple[Array, Array]]  # p (n,) -> r (m,) and dr/dp (m, n)

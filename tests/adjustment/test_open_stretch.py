@@ -12,10 +12,9 @@ from support.scenes import random_rotation
 from support.targets import photographed
 
 from neurocal_cli import calibrate
+from neurocal_cli.adjustment import open_choices
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.board import open_stretch as open_stretch_module
-from neurocal_cli.adjustment.board.open_stretch import open_stretch, spread_of_stretch, stretches
-from neurocal_cli.adjustment.open_coefficients import SpreadOfOpen
+from neurocal_cli.adjustment.open_choices import SpreadOfOpen, open_stretch, spread_of_stretch, stretches
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.rig import covariance
@@ -66,7 +65,7 @@ def test_the_camera_follows_a_stretch_as_a_fit_anew_does(which: int, monkeypatch
     solution = fit(problem, options_for("lm", 20, 0))
     views, free = solution.problem.views, solution.problem.free_camera
     state = adjust(views.batches, solution.state, free, True, 20).state
-    only(which, monkeypatch, open_stretch_module)
+    only(which, monkeypatch, open_choices)
     found = open_stretch(views, state, free, points.world, 1.0)
     assert found is not None
     stretched = replace(views, local=views.local @ (np.eye(3) + EPS * stretches(points.world)[which]))
@@ -101,7 +100,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
 
 def test_the_spread_is_that_of_all_models() -> None:
     """By quadrature, for a stretch that camera and pixels tell apart from the lean."""
-    size = open_stretch_module.STRETCH
+    size = open_choices.STRETCH
     variance, told, off = 0.25, np.array([1.2e-3, 0.8e-3]), np.array([2e-3, -0.3e-3])
     S = np.diag([1.0, *(variance / told**2)])
     found = spread_of_stretch(S, np.append(0.0, off * variance / told**2), variance)
@@ -110,7 +109,7 @@ def test_the_spread_is_that_of_all_models() -> None:
     absent = 1.0
     for n in (0, 1):
         likelihood = np.exp(-0.5 * ((o - off[n]) ** 2 - off[n] ** 2) / told[n] ** 2)
-        states = open_stretch_module._ODDS[n].items()
+        states = open_choices._ODDS_OF_PRINTS[n].items()
         prior = sum(odds / (by * size) * np.exp(-0.5 * (o / (by * size)) ** 2) for by, odds in states)
         slab = likelihood * prior / np.sqrt(2 * np.pi) * (o[1] - o[0])
         total = 1.0 + slab.sum()

@@ -10,14 +10,12 @@ from support.scenes import random_flat_set
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
-from neurocal_cli.adjustment import view_covariance
+from neurocal_cli.adjustment import covariance as covariance_module
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.chi_squared import chi_squared, exceeded_by_chance
-from neurocal_cli.adjustment.covariance import covariance
-from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.leave_out import Quadratics
+from neurocal_cli.adjustment.covariance import counting_views, covariance
+from neurocal_cli.adjustment.cross_validation import Quadratics, reduced
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.view_covariance import counting_views
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict.assessment import _AtMinimum
 
@@ -122,7 +120,7 @@ def test_std_hold_where_each_view_has_a_focal_length_of_its_own(n_views: int, se
 
 
 def test_the_covariance_is_nowhere_below_the_normal_matrix_s(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view_covariance, "_contradict", lambda *_: True)
+    monkeypatch.setattr(covariance_module, "_contradict", lambda *_: True)
     rng = np.random.default_rng(11)
     scene = random_flat_set(rng, 6, False, cols=8, rows=6)
     views = arrange(scene.points(0.2, rng))
@@ -145,7 +143,7 @@ def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
     whole = calibrate(points, **options)
     others = [calibrate(points.select(points.view_index != k), **options) for k in range(10)]
     m = _AtMinimum(whole)
-    told = view_covariance._jackknife(reduced(m.normal, m.free, True).moves_without_each())
+    told = covariance_module._jackknife(reduced(m.normal, m.free, True).moves_without_each())
     alphas = np.array([c.intrinsics.alpha_u for c in others])
     jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())
     assert np.sqrt(told[0, 0]) * m.views.pixel_scale == pytest.approx(jackknife, rel=0.05)
@@ -162,12 +160,12 @@ def test_the_jackknife_of_noise_is_as_expected() -> None:
         g = (np.swapaxes(J, 1, 2) @ (sigma * rng.standard_normal((V, rows, 1))))[..., 0]
         g -= S @ np.linalg.solve(S.sum(axis=0), g.sum(axis=0))
         moves = Quadratics(S, g, np.zeros(V)).moves_without_each()
-        total += view_covariance._jackknife(moves) / draws
-    expected = view_covariance._expected(Quadratics(S, np.zeros((V, 4)), np.zeros(V)), np.ones(V), sigma**2)
+        total += covariance_module._jackknife(moves) / draws
+    expected = covariance_module._expected(Quadratics(S, np.zeros((V, 4)), np.zeros(V)), np.ones(V), sigma**2)
     plain = sigma**2 * np.linalg.inv(S.sum(axis=0))
     # The last view has half of the information.
-    assert view_covariance._size(expected, plain) > 1.2
-    assert view_covariance._size(total, expected) == pytest.approx(1.0, abs=0.1)
+    assert covariance_module._size(expected, plain) > 1.2
+    assert covariance_module._size(total, expected) == pytest.approx(1.0, abs=0.1)
 
 
 def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_each_other() -> None:

@@ -9,7 +9,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.observations.board import Board
-from neurocal_cli.observations.found_planes import with_found_points
+from neurocal_cli.observations.estimated_board import with_found_points
 from neurocal_cli.observations.target import Target, board_of
 
 

@@ -15,7 +15,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.observations.board import Board
-from neurocal_cli.observations.laid_points import laid
+from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 

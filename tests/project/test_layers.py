@@ -193,12 +193,11 @@ def test_a_calibration_imports_nothing_that_it_is_not_asked_for() -> None:
     assert "calibration.calibrate" in loaded, done.stderr
     assert not loaded & {
         "adjustment.board.posterior",
-        "adjustment.open_coefficients",
+        "adjustment.open_choices",
         "calibration.lens_choice.candidate_models",
         "calibration.outlier_rejection",
         "calibration.target_choice",
-        "camera.similar_lens",
-        "network.random_cameras",
+        "camera.nearest_camera",
     }
 
 

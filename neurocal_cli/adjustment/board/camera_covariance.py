@@ -1,8 +1,8 @@
 """Covariance of a calibrated camera and its poses, for all code that reports or uses it.
 
 It combines the normal matrices with the uncertainty of an estimated target (`uncertainty`), the jackknife
-over views (`view_covariance`), and the model uncertainty of the selected distortion model and target
-(`open_coefficients`, `open_stretch`).
+over views (`counting_views`), and the model uncertainty of the selected distortion model and target
+(`open_choices`).
 """
 
 from __future__ import annotations
@@ -14,13 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, covariance, residual_variance
+from neurocal_cli.adjustment.covariance import (
+    Covariance,
+    CovarianceBasis,
+    counting_views,
+    covariance,
+    residual_variance,
+)
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import free_columns, normal_blocks, pose_response
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import TargetPosterior
-from neurocal_cli.adjustment.view_covariance import counting_views
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -29,7 +34,7 @@ from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
 if TYPE_CHECKING:
-    from neurocal_cli.adjustment.open_coefficients import OpenCoefficients
+    from neurocal_cli.adjustment.open_choices import OpenCoefficients
 
 
 @frozen_dataclass(eq=False)
@@ -112,14 +117,14 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
 def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """Add the uncertainty from the selection of the distortion model."""
-    from neurocal_cli.adjustment import open_coefficients as coefficients
+    from neurocal_cli.adjustment import open_choices as choices
 
     views, state = seen.views, seen.state
-    corner = coefficients.corner_radius(
+    corner = choices.corner_radius(
         state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
     )
-    richer = coefficients.open_coefficients(
-        state.model, state.k, seen.free, seen.choice, coefficients.radius(views, state), corner
+    richer = choices.open_coefficients(
+        state.model, state.k, seen.free, seen.choice, choices.radius(views, state), corner
     )
     if richer is None:
         return known
@@ -128,9 +133,9 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
     left_out = richer.prior.left_out
-    spread = coefficients.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    spread = choices.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     E, follow = spread.E, spread.follow
-    entries = coefficients.wide_covariance(known.found.entries, E, follow, left_out)
+    entries = choices.wide_covariance(known.found.entries, E, follow, left_out)
     if not np.isfinite(entries).all():
         return known
     poses = known.found.poses
@@ -143,7 +148,7 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
 
 def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """Add the uncertainty from keeping the given target."""
-    from neurocal_cli.adjustment.board.open_stretch import open_stretch
+    from neurocal_cli.adjustment.open_choices import open_stretch
 
     added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
     if added is None:

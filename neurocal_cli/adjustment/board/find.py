@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.board.bend_evidence import bends_are_valid, most_probable_precision
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
@@ -33,8 +32,13 @@ from neurocal_cli.adjustment.board.posterior import (
     posterior_of,
 )
 from neurocal_cli.adjustment.board.prior import SINGLE, nearest_to_given, prior_of
-from neurocal_cli.adjustment.board.target_validation import folds_of, passes_cross_validation
-from neurocal_cli.adjustment.board.without_poses import WithoutPoses
+from neurocal_cli.adjustment.board.system import WithoutPoses
+from neurocal_cli.adjustment.board.validation import (
+    bends_are_valid,
+    folds_of,
+    most_probable_precision,
+    passes_cross_validation,
+)
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median

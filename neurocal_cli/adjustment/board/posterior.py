@@ -34,9 +34,9 @@ from neurocal_cli.adjustment.board.system import (
     PointsFirst,
     PosesFirst,
     Solved,
+    WithoutPoses,
     system_of,
 )
-from neurocal_cli.adjustment.board.without_poses import WithoutPoses
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

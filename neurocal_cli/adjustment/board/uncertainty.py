@@ -16,19 +16,20 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.derivatives import blocks_by_batch, linearised
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
+    blocks_by_batch,
     folded_information,
     information_of,
     joined_without_each,
+    linearised,
 )
 from neurocal_cli.adjustment.board.posterior import camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
-from neurocal_cli.adjustment.board.target_validation import without_each
-from neurocal_cli.adjustment.board.without_poses import WithoutPoses
+from neurocal_cli.adjustment.board.system import WithoutPoses
+from neurocal_cli.adjustment.board.validation import without_each
 from neurocal_cli.adjustment.covariance import CovarianceBasis
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.solution import TargetPosterior

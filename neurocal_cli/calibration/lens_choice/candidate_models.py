@@ -8,17 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.covariance import counting_views, covariance
 from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_views, reduced
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.observability import is_weak, refuse_undetermined
-from neurocal_cli.adjustment.open_coefficients import radius
+from neurocal_cli.adjustment.open_choices import radius
 from neurocal_cli.adjustment.outlier_views import free_networks, least_of_free_networks
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
-from neurocal_cli.adjustment.view_covariance import counting_views
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back, normal_part
 from neurocal_cli.camera.directions import WIDE
@@ -32,7 +31,7 @@ from neurocal_cli.camera.distortion import (
 )
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.similar_lens import similar_states
+from neurocal_cli.camera.nearest_camera import similar_states
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 

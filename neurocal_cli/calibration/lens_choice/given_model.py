@@ -74,7 +74,7 @@ def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
     """The lowest minimum of the wanted model from all starts."""
     # Imported here, because most calibrations need no other starts.
     from neurocal_cli.calibration.lens_choice.candidate_models import fit_candidates
-    from neurocal_cli.camera.similar_lens import similar_states
+    from neurocal_cli.camera.nearest_camera import similar_states
 
     problem, best = solution.problem, solution.adjusted
     wanted = problem.distortion.model

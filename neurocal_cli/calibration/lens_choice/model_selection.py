@@ -31,7 +31,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.find import Found, evidence_of_views, find_target, views_for_target
 from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
-from neurocal_cli.adjustment.open_coefficients import log_prior, radius
+from neurocal_cli.adjustment.open_choices import log_prior, radius
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.reprojection import camera_columns, normal_blocks

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted, Penalty
-from neurocal_cli.adjustment.leave_out import quietly
+from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, radial_part

@@ -34,7 +34,7 @@ import numpy as np
 from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.cross_validation import held_out_views, reduced
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.adjustment.open_coefficients import fisheye_sizes
+from neurocal_cli.adjustment.open_choices import fisheye_sizes
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import normal_blocks

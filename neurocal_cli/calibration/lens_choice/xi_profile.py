@@ -27,7 +27,7 @@ from neurocal_cli.calibration.lens_choice.given_model import total_cost
 from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.similar_lens import similar_states
+from neurocal_cli.camera.nearest_camera import similar_states
 from neurocal_cli.camera.state import CameraState
 
 # Repeated by test_wide_lenses.py (slow: a thousand cameras): all at the lowest minimum, their errors

@@ -15,8 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.leave_out import folds_of, quietly
+from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
 from neurocal_cli.calibration.rig.causes import EACH_PART, SAME_MOMENT, TAKEN, Named

@@ -7,8 +7,8 @@
 * A target that was estimated with the cameras, and so is uncertain as well (`with_target_uncertainty`).
 * Unknowns that the common fit left out. They are open unknowns of the common bundle adjustment, as for a
   single camera: coefficients that the selected distortion models lack (`covariance_of_choice`, see
-  `adjustment.open_coefficients`), and two stretches of the print if the given target was kept
-  (`covariance_of_stretch`, see `adjustment.board.open_stretch`).
+  `adjustment.open_choices`), and two stretches of the print if the given target was kept
+  (`covariance_of_stretch`, see `open_choices`).
 * Cameras that were given with a covariance S of their own (`covariance_by_given`). The rig, a second camera
   and the poses follow an error d of the given cameras as they would follow these parameters if they were
   estimated: with the poses eliminated, N_ff x + N_fd d = 0 for the free shared unknowns x. So x has the
@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.board.information import Information, point_terms
-from neurocal_cli.adjustment.board.open_stretch import spread_of_stretch, stretched_blocks, stretches
 from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
@@ -40,11 +39,14 @@ from neurocal_cli.adjustment.normal_equations import (
     solve_scaled,
     unit_diagonal,
 )
-from neurocal_cli.adjustment.open_coefficients import (
+from neurocal_cli.adjustment.open_choices import (
     OpenCoefficients,
     OpenPrior,
     open_at_points,
     spread_of_open,
+    spread_of_stretch,
+    stretched_blocks,
+    stretches,
 )
 from neurocal_cli.adjustment.reprojection import camera_columns
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter

@@ -34,7 +34,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median, rotation_vector
 from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
-from neurocal_cli.observations.laid_points import laid
+from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
 # Given points show a target of another size if the baseline differs by more than this share while the views'

@@ -8,7 +8,7 @@ from typing import Any
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.camera.late_import import late
-from neurocal_cli.camera.plane_points import PlaneErrors
+from neurocal_cli.camera.measured import PlaneErrors
 
 
 class FixedCameras(Presented):

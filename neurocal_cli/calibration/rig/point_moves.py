@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.cross_validation import inverse_or_nan
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given

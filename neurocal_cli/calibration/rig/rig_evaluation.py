@@ -22,7 +22,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.observations.laid_points import laid
+from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
 

@@ -11,7 +11,7 @@ from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.plane_points import PlaneErrors, Spread
+from neurocal_cli.camera.measured import PlaneErrors, Spread
 from neurocal_cli.errors import InputError
 
 

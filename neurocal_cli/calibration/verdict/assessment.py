@@ -18,8 +18,14 @@ from neurocal_cli.adjustment.board.camera_covariance import CameraSeen, camera_c
 from neurocal_cli.adjustment.chi_squared import chi_squared
 from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.covariance import covariance_by_camera, entry_covariance
-from neurocal_cli.adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
-from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.cross_validation import (
+    FOLDS,
+    Minimum,
+    disagreement,
+    held_out,
+    inverse_or_nan,
+    reduced,
+)
 from neurocal_cli.adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.repeated_poses import repeated_poses

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import Quadratics
+from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.calibration.verdict.linearised import Linearised

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.adjustment.cross_validation import Minimum
-from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.cross_validation import Minimum, inverse_or_nan
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.leave_out import least_by_precision, quietly
+from neurocal_cli.adjustment.cross_validation import least_by_precision, quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.verdict.findings import Limit, in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised

@@ -323,7 +323,7 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
     """Findings about an estimated flat target that differs from its description as no print does."""
     if target.plane.any() or not is_flat(target.given):
         return
-    from neurocal_cli.adjustment.board.open_stretch import stretches
+    from neurocal_cli.adjustment.open_choices import stretches
 
     given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
     linear = np.linalg.lstsq(given, found, rcond=None)[0]

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neurocal_cli.camera.camera_position import CameraPosition
-from neurocal_cli.camera.plane_points import PlaneErrors, Spread
+from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, Spread
 from neurocal_cli.commands.show.text import Table, printable, rounded, with_std
 
 

@@ -1,4 +1,4 @@
-"""Points and lengths on a plane, with what makes them uncertain."""
+"""Positions, pixels, points and lengths that a calibration tells, with what makes them uncertain."""
 
 from __future__ import annotations
 
@@ -7,6 +7,55 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+
+
+@frozen_dataclass(eq=False)
+class CameraPosition:
+    """The centre of a camera in the coordinates of the target of a view.
+
+    Attributes
+    ----------
+    point : (3,) array [world unit]
+    covariance : (3, 3) array or None [world unit^2]
+        None if the calibration has no points of its own.
+    """
+
+    point: Array
+    covariance: Array | None
+
+    @property
+    def std(self) -> Array:
+        """(3,) standard deviations of X, Y and Z [world unit]; nan where they are unknown."""
+        if self.covariance is None:
+            return np.full(3, np.nan)
+        return np.asarray(np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0)))
+
+
+@frozen_dataclass(eq=False)
+class ProjectedPoints:
+    """Pixels of N points.
+
+    Attributes
+    ----------
+    pixels : (N, 2) array [px]
+        ``nan`` for points that the camera does not see.
+    covariance : (N, 2, 2) array or None [px^2]
+        Of the pixels, due to the calibration alone: a measured pixel has its own noise in addition. None if
+        the calibration has no points from which it can be computed, as after ``--lean``.
+    seen : (N,) bool array
+        Whether the point is in front of the camera, so that it has a pixel; it may lie outside the image.
+    """
+
+    pixels: Array
+    covariance: Array | None
+    seen: NDArray[np.bool_]
+
+    @property
+    def std(self) -> Array | None:
+        """(N,) standard deviation of both coordinates together, ``sqrt(var u + var v)`` [px]."""
+        if self.covariance is None:
+            return None
+        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2)))
 
 
 @frozen_dataclass(eq=False)
