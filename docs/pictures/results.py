@@ -6,10 +6,9 @@ from pathlib import Path
 
 from neurocal_cli.commands.show.simulation_plots import draw_rates, draw_simulation
 from neurocal_cli.files.processes import usable_cores
-from neurocal_cli.simulation.noise import study_noise
-from neurocal_cli.simulation.rates import study_rates
+from neurocal_cli.simulation.comparison import study_noise
 from neurocal_cli.simulation.scenes import paper_scene
-from neurocal_cli.simulation.starts import study_starts
+from neurocal_cli.simulation.starts import study_rates, study_starts
 
 HERE = Path(__file__).resolve().parent
 SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)

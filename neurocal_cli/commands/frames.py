@@ -112,7 +112,7 @@ def watch_for_images(
     Returns the outcomes by path, in the order in which the images arrived.
     """
     from neurocal_cli.detection.batch import detect_file
-    from neurocal_cli.detection.identity.placement import NoBoardError
+    from neurocal_cli.detection.placement import NoBoardError
 
     outcomes: dict[str, Outcome] = {}
     waiting: list[str] = []  # for the size of the board

@@ -49,7 +49,7 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
     Unless an image shows all ends of the board, it is a NoBoardError to have less than `enough` images.
     """
     from neurocal_cli.detection.board_kind import found_board
-    from neurocal_cli.detection.identity.placement import NoBoardError
+    from neurocal_cli.detection.placement import NoBoardError
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.board_kinds import CirclePlane, found_words, unit_length
 
@@ -88,8 +88,8 @@ def compare_markers(paths: Sequence[str], board: Board) -> None:
     It is a NeurocalError if they show other columns, whose markers would be called wrongly, or another kind;
     of more or fewer rows, a warning.
     """
-    from neurocal_cli.detection.identity.placement import NoBoardError
     from neurocal_cli.detection.markers.found import agreed_markers, seen_markers
+    from neurocal_cli.detection.placement import NoBoardError
     from neurocal_cli.observations.board_kinds import TagPlane, found_words
 
     plane = board.planes[0]

@@ -201,7 +201,7 @@ def simulate(
         _save(scene, save, levels, seed, images)
     from neurocal_cli.commands.show.methods_report import simulation_json, simulation_tables, text_of
     from neurocal_cli.commands.show.simulation_plots import draw_simulation
-    from neurocal_cli.simulation.noise import study_noise
+    from neurocal_cli.simulation.comparison import study_noise
 
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
@@ -263,7 +263,7 @@ def _starts(
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
     from neurocal_cli.commands.show.methods_report import rates_json, rates_tables, text_of
     from neurocal_cli.commands.show.simulation_plots import draw_rates
-    from neurocal_cli.simulation.rates import study_rates
+    from neurocal_cli.simulation.starts import study_rates
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)

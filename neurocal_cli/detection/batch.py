@@ -30,9 +30,9 @@ from neurocal_cli import __version__
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import Detection, detect_points, grids_in
-from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
+from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.images import Image, encode_png, parse_image
 from neurocal_cli.files.processes import start_worker, usable_cores, work_through

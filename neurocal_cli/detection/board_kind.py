@@ -3,25 +3,190 @@
 Each image is searched for a chessboard, and if there is none for markers and for circles. Once one of these
 is seen, it is looked for first. Squares that are not of one colour have markers in them, and are no
 chessboard. The kind is that of most images, and these tell its size.
+
+For the size of a chessboard, each image votes for that of its foremost grid, unless the image cuts it off. A
+vote for a grid without gaps counts before one with gaps, and a vote is sure if the board is seen to end at
+all sides. Parts of a board, in images in which something hides some of it, have smaller sizes that seldom
+agree. So the largest size with enough votes is the board's.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import field
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.detection.board_size import SeenBoard, agreed_size, is_certain, seen_board
 from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, seen_circles
-from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
+from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.found import SeenMarkers, agreed_markers, seen_markers
+from neurocal_cli.detection.placement import End, NoBoardError, board_ends
+from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import Board, Plane
 
+Size = tuple[int, int]  # columns and rows of inner vertices, the larger number first
+
+# test_board_size.py finds the sizes of all boards with these limits.
+_COMPLETE = 0.9  # least share of the vertices of a whole grid that were found
+_OUTER = 0.6  # least share of them in its outer lines
+_BORDER = 2.5  # squares between a grid with gaps and the image border
+_BESIDE = 1.5  # boards whose squares are smaller by more than this are behind the foremost one
+_ENOUGH = 0.2  # least share of the votes for the board's size, and greatest share of the grids that exceed it
+_CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
+_WITHIN = np.linspace(0.2, 0.8, 9)  # of a square, where its levels are looked at
+# Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
+# and 0.1 and more on boards with markers.
+_LEVEL = 0.07
+
+
+class Vote(IntEnum):
+    """How much a grid says about the size of its board."""
+
+    NONE = 0  # the pattern goes on beyond it, or the image may cut it off
+    PART = 1  # it has gaps
+    WHOLE = 2
+    SURE = 3  # the board is seen to end at all sides
+
+
+@frozen_dataclass
+class SeenBoard:
+    """The foremost grid of an image."""
+
+    size: Size
+    vote: Vote
+    beside: tuple[Size, ...] = ()  # whole grids next to it, not far behind
+    plain: bool = True  # whether its squares have one colour each, and no markers in them
+
+
+@frozen_dataclass
+class FoundSize:
+    """The size of a board that images agree on."""
+
+    size: Size
+    sure: bool  # whether an image shows all its ends
+
+
+def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
+    """The foremost chessboard of a grey image; None if there is none."""
+    grids = find_grids(grey)
+    if not grids:
+        return None
+    foremost, *others = grids
+    ends = board_ends(grey, foremost)
+    states = set(ends.values())
+    if {End.PATTERN, End.OUTSIDE} & states:
+        vote = Vote.NONE
+    elif not _is_whole(foremost.seen):
+        vote = Vote.NONE if _near_border(foremost, grey.shape) else Vote.PART
+    else:
+        vote = Vote.SURE if states == {End.BOARD} else Vote.WHOLE
+    near = (x for x in others if _is_whole(x.seen) and x.square * _BESIDE > foremost.square)
+    beside = tuple(_ordered(x.shape) for x in near)
+    return SeenBoard(_ordered(foremost.shape), vote, beside, _is_plain(grey, foremost))
+
+
+def _is_plain(grey: NDArray[np.generic], grid: Grid) -> bool:
+    """Whether most squares of either colour are of one level, compared with the contrast of the board."""
+    p = grid.pixels
+    corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
+    whole = np.isfinite(corners).all(axis=(2, 3))
+    a, b = np.meshgrid(_WITHIN, _WITHIN)
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b]).reshape(4, -1)
+    levels = interpolate(grey_levels(grey), np.einsum("kn,mkd->mnd", weights, corners[whole]))
+    # Means of nine samples are hardly noisy.
+    means = levels.reshape(-1, 3, 3, 3, 3).mean(axis=(2, 4)).reshape(-1, 9)
+    colour = (np.indices(whole.shape).sum(axis=0) % 2)[whole]
+    if min(np.bincount(colour, minlength=2)) == 0:
+        return True
+    middle = [float(np.median(means[colour == k])) for k in (0, 1)]
+    spread = max(float(np.median(means[colour == k].std(axis=1))) for k in (0, 1))
+    return spread < _LEVEL * abs(middle[1] - middle[0])
+
+
+def _is_whole(seen: NDArray[np.bool_]) -> bool:
+    outer = min(float(line.mean()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
+    return bool(seen.mean() >= _COMPLETE and outer >= _OUTER)
+
+
+def _near_border(grid: Grid, shape: tuple[int, ...]) -> bool:
+    """Whether the next line of vertices may lie outside the image."""
+    low, high = np.nanmin(grid.pixels, axis=(0, 1)), np.nanmax(grid.pixels, axis=(0, 1))
+    return bool(min(*low, *(shape[::-1] - high)) < _BORDER * grid.square)
+
+
+def _ordered(shape: Size) -> Size:
+    return max(shape), min(shape)
+
+
+def _holds(large: Size, small: Size) -> bool:
+    return large[0] >= small[0] and large[1] >= small[1]
+
+
+def is_certain(seen: Sequence[SeenBoard]) -> bool:
+    """Whether further images need not be examined: there are enough votes, and all grids are parts of it."""
+    votes = Counter(one.size for one in seen if one.vote >= Vote.WHOLE and not one.beside)
+    if not votes:
+        return False
+    size, count = votes.most_common(1)[0]
+    sure = any(one.vote == Vote.SURE for one in seen if one.size == size)
+    needed = _CERTAIN if sure else _CERTAIN_UNSURE
+    return count >= needed and 2 * count > len(seen) and all(_holds(size, one.size) for one in seen)
+
+
+def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
+    """The size of the board that at least one image shows; see `board_kind`."""
+    several = [one for one in seen if one.beside]
+    if 2 * len(several) > len(seen):
+        sizes, _ = Counter(tuple(sorted((one.size, *one.beside))) for one in several).most_common(1)[0]
+        raise NoBoardError(
+            f"the images show {len(sizes)} chessboards beside each other, of {_names(sizes)} inner vertices; "
+            "describe them in a board file and give it with --board, or show only one of them"
+        )
+    sure = Counter(one.size for one in seen if one.vote == Vote.SURE)
+    enough = _with_enough_votes(seen, Vote.WHOLE) or _with_enough_votes(seen, Vote.PART)
+    best = max(enough, key=lambda size: (size[0] * size[1], size), default=(0, 0))
+    if other := next((size for size in enough if not _holds(best, size)), None):
+        raise NoBoardError(
+            f"the images show boards of different sizes, {_names((best, other))} inner vertices; give the "
+            "size of yours by --cols and --rows"
+        )
+    if sum(not _holds(best, one.size) for one in seen) > _ENOUGH * len(seen):
+        parts = [size for size, _ in Counter(one.size for one in seen).most_common(3)]
+        raise NoBoardError(
+            f"only parts of a chessboard are seen, of {_names(parts)} inner vertices in "
+            f"{plural(len(seen), 'image')}; give its size by --cols and --rows, or show it whole"
+        )
+    if sure and not sure[best]:
+        # A smaller one whose ends are seen is no part of a larger one, which may have a false line.
+        best = max(enough, key=lambda size: (sure[size], enough[size]))
+    return FoundSize(best, sure[best] > 0)
+
+
+def _with_enough_votes(seen: Sequence[SeenBoard], least: Vote) -> dict[Size, int]:
+    """Sizes with enough votes of some kind, and their numbers; a single one must be sure or the only grid."""
+    votes = Counter(one.size for one in seen if one.vote >= least)
+    sure = {one.size for one in seen if one.vote == Vote.SURE}
+    alone = len(seen) == 1 and least == Vote.WHOLE
+    return {
+        size: count
+        for size, count in votes.items()
+        if count >= _ENOUGH * votes.total() and (count > 1 or size in sure or alone)
+    }
+
+
+def _names(sizes: Iterable[Size]) -> str:
+    *names, last = (f"{cols} x {rows}" for cols, rows in sizes)
+    return f"{', '.join(names)} and {last}" if names else last
+
+
 _MOST_TRIED = 5  # images without a chessboard, markers and circles that are searched for all of these
-_ENOUGH = 5  # images of a grid of circles, or of markers that tell all of their board
+_ENOUGH_KINDS = 5  # images of a grid of circles, or of markers that tell all of their board
 _MOST_MARKED = 12  # images of markers that are examined
 
 
@@ -85,11 +250,11 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
             without += 1
         if is_certain(seen.squares) and seen.kind is seen.squares:
             break
-        if len(seen.marked) in (_ENOUGH, _MOST_MARKED) and seen.kind is seen.marked:
+        if len(seen.marked) in (_ENOUGH_KINDS, _MOST_MARKED) and seen.kind is seen.marked:
             found = _marked(seen)
             if found.sure or len(seen.marked) == _MOST_MARKED:
                 return found
-        if sum(one.whole for one in seen.circles) >= _ENOUGH and seen.kind is seen.circles:
+        if sum(one.whole for one in seen.circles) >= _ENOUGH_KINDS and seen.kind is seen.circles:
             break
     if not seen.kind and seen.patterned:
         raise NoBoardError(

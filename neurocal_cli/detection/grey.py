@@ -61,3 +61,12 @@ def negative(image: NDArray[Any]) -> NDArray[Any]:
     """Exchange light and dark in a grey image."""
     brightest = np.iinfo(image.dtype).max if image.dtype.kind == "u" else image.max()
     return np.asarray(brightest - image)
+
+
+def eight_bits(image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """The image with the grey levels of 8 bits, its brightest pixels at full scale."""
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image, dtype=np.uint8)
+    real = image.astype(np.float32)
+    low, high = (float(x) for x in np.quantile(real[::4, ::4], [0.001, 0.999]))
+    return np.asarray(np.clip((real - low) * (255 / max(high - low, 1e-9)), 0, 255), dtype=np.uint8)

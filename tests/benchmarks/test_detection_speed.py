@@ -11,11 +11,11 @@ from support.real_data import RealFiles
 from support.rendered import picture
 
 from neurocal_cli.detection.batch import retain_freed_memory
-from neurocal_cli.detection.board_size import seen_board
+from neurocal_cli.detection.board_kind import seen_board
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import measure
+from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board import Board
 
 cv2 = pytest.importorskip("cv2")

@@ -13,10 +13,9 @@ from support.real_data import RealFiles
 from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
 from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, seen_circles
 from neurocal_cli.detection.detect import detect_points
-from neurocal_cli.detection.identity.placement import NoBoardError
-from neurocal_cli.detection.markers.lie import lie_of
-from neurocal_cli.detection.markers.numbering import joined, layouts, numbered
+from neurocal_cli.detection.markers.numbering import joined, layouts, lie_of, numbered
 from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.files.board_kinds import kind_of
 from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import TagPlane

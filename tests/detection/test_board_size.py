@@ -9,13 +9,18 @@ from support.real_data import RealFiles
 from support.rendered import CONDITIONS, condition, picture
 from support.slow_cases import slow_but
 
-from neurocal_cli.detection.board_kind import find_board, found_board
-from neurocal_cli.detection.board_size import SeenBoard, Vote, agreed_size, seen_board
+from neurocal_cli.detection.board_kind import (
+    SeenBoard,
+    Vote,
+    agreed_size,
+    find_board,
+    found_board,
+    seen_board,
+)
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.identity.ends import End, board_ends
-from neurocal_cli.detection.identity.identify import identify
-from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.identify import identify
+from neurocal_cli.detection.placement import End, NoBoardError, board_ends
 from neurocal_cli.files.board_kinds import kind_of
 from neurocal_cli.observations.board import Board
 

@@ -11,11 +11,10 @@ from support.occluders import Disc
 from support.picture_bound import edge_bound
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.blobs import Blobs
-from neurocal_cli.detection.circles.fitting import _missed
-from neurocal_cli.detection.circles.lattice import place_circles
+from neurocal_cli.detection.circles.lattice import Blobs, place_circles
+from neurocal_cli.detection.circles.measuring import _missed
 from neurocal_cli.detection.detect import Detection, detect_points
-from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.board_kinds import CirclePlane

@@ -17,10 +17,10 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.detect import Detection, detect_points
-from neurocal_cli.detection.fitting.grid_edges import GridEdges, GridImage
 from neurocal_cli.detection.fitting.grid_fit import fit_grid
+from neurocal_cli.detection.fitting.map_fit import WideMap
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.wide_map import WideMap
+from neurocal_cli.detection.fitting.strips import GridEdges, GridImage
 from neurocal_cli.detection.measuring import edges_served, positions_along_edges
 from neurocal_cli.files.images import read_image
 from neurocal_cli.observations.board import Board, Plane

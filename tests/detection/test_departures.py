@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.fitting.departures import Departures, find_departures
+from neurocal_cli.detection.measuring import Departures, find_departures
 
 NOISE = 0.01  # px
 

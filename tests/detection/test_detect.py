@@ -14,8 +14,8 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
 from neurocal_cli.detection.detect import Detection, detect_points, label
-from neurocal_cli.detection.identity.identify import Identified, Located
-from neurocal_cli.detection.identity.placement import NoBoardError, Placement
+from neurocal_cli.detection.identify import Identified, Located
+from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences

@@ -15,12 +15,14 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import Grid
-from neurocal_cli.detection.identity.ends import DIRECTIONS, End, board_ends
-from neurocal_cli.detection.identity.identify import fit_camera, identify, rigid_motion
-from neurocal_cli.detection.identity.placement import (
+from neurocal_cli.detection.identify import fit_camera, identify, rigid_motion
+from neurocal_cli.detection.placement import (
+    DIRECTIONS,
     SYMMETRIC_BOARD,
+    End,
     NoBoardError,
     Placement,
+    board_ends,
     placements,
     trimmed,
 )

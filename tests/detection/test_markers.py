@@ -16,10 +16,10 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
-from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
 from neurocal_cli.detection.markers.lattice import place
 from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import TagPlane
@@ -235,7 +235,7 @@ def tags_alone(plane: Plane) -> tuple[Array, Array, NDArray[np.bool_]]:
 def test_tags_without_squares_have_the_mid_points_of_their_edges(
     condition: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurocal_cli.simulation.rendering.patterns.printed_rectangles", tags_alone)
+    monkeypatch.setattr("neurocal_cli.simulation.rendering.scene.printed_rectangles", tags_alone)
     scene = marked_scene(plane_of("aprilgrid:3x2:40:0.25"), 6, square=56, **condition)
     picture = taken(scene, 6)
     found = detect_points(picture.image, scene.board)

@@ -11,7 +11,7 @@ import pytest
 from support.command_line import run
 from support.places import SAMPLES
 
-from neurocal_cli.detection.other_targets import other_target
+from neurocal_cli.detection.detect import other_target
 from neurocal_cli.files.images import read_image
 
 

@@ -17,8 +17,12 @@ from support.slow_cases import slow_but
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.fitting.edge_profile import erf_and_density
-from neurocal_cli.detection.fitting.sharpening import EdgeProfile, Sharpening, find_sharpening
+from neurocal_cli.detection.fitting.edge_profile import (
+    EdgeProfile,
+    Sharpening,
+    erf_and_density,
+    find_sharpening,
+)
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.simulation.rendering import Rendered, Scene
 

@@ -14,8 +14,8 @@ from support.wide_camera import WideCamera
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.detection.fitting.map_fit import WideMap, wide_start
 from neurocal_cli.detection.fitting.smooth_map import Frame
-from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.wide_lens import WideLens, fit_wide_lens
 from neurocal_cli.observations.board import Board
 from neurocal_cli.simulation.rendering import PlaneTruth, render

@@ -25,8 +25,7 @@ from neurocal_cli.commands.show.simulation_plots import draw_rates
 from neurocal_cli.commands.streams import for_json
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.observations.board import Board
-from neurocal_cli.simulation.noise import NoiseStudy, cramer_rao, study_noise
-from neurocal_cli.simulation.rates import data_set, study_rates
+from neurocal_cli.simulation.comparison import NoiseStudy, cramer_rao, study_noise
 from neurocal_cli.simulation.scenes import (
     PAPER_BOARD,
     PAPER_CAMERA,
@@ -39,7 +38,7 @@ from neurocal_cli.simulation.scenes import (
     true_calibration,
     visible_points,
 )
-from neurocal_cli.simulation.starts import can_start, single_start, study_starts
+from neurocal_cli.simulation.starts import can_start, data_set, single_start, study_rates, study_starts
 
 METHODS = ("neuro", "nonlinear", "linear", "tsai")
 LENS = Camera(Intrinsics(700.0, 705.0, 320.0, 236.0), Distortion("k1", [-0.2]), (640, 480))

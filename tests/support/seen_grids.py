@@ -6,7 +6,7 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import Grid
-from neurocal_cli.detection.identity.identify import Identified
+from neurocal_cli.detection.identify import Identified
 from neurocal_cli.simulation.rendering import PlaneTruth, Rendered, Scene
 
 

@@ -21,11 +21,9 @@ from neurocal_cli.commands.show.text import (
     with_std,
 )
 from neurocal_cli.errors import plural
-from neurocal_cli.simulation.comparison import Compared, Comparison
-from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
-from neurocal_cli.simulation.rates import RateStudy
+from neurocal_cli.simulation.comparison import Compared, Comparison, MethodErrors, NoiseStudy
 from neurocal_cli.simulation.scenes import SimulatedScene
-from neurocal_cli.simulation.starts import StartStudy
+from neurocal_cli.simulation.starts import RateStudy, StartStudy
 
 FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
 # The errors in the paper's Table 1, calibrated minus true.

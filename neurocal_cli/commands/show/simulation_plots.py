@@ -8,9 +8,8 @@ import numpy as np
 
 from neurocal_cli.commands.show.figure import ACCENT, picture, style
 from neurocal_cli.commands.show.methods_report import FIG_1
-from neurocal_cli.simulation.noise import NoiseStudy
-from neurocal_cli.simulation.rates import RateStudy
-from neurocal_cli.simulation.starts import StartStudy
+from neurocal_cli.simulation.comparison import NoiseStudy
+from neurocal_cli.simulation.starts import RateStudy, StartStudy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,1 +1,1 @@
-"""Grids of circles: `blobs` finds round marks, `lattice` places them, `fitting` measures their centres."""
+"""Grids of circles: `lattice` finds and places round marks, `measuring` measures their centres."""

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.blobs import Blobs, find_blobs
-from neurocal_cli.detection.circles.lattice import BASES, largest_lattice
+from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice
 from neurocal_cli.detection.finding.saddles import interpolate
-from neurocal_cli.detection.identity.placement import NoBoardError
-from neurocal_cli.detection.markers.lattice import homographies, homography_at
-from neurocal_cli.detection.markers.reading import eight_bits
+from neurocal_cli.detection.grey import eight_bits
+from neurocal_cli.detection.markers.reading import homographies, homography_at
+from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 _FEWEST = 12  # circles

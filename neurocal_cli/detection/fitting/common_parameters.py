@@ -41,11 +41,10 @@ from neurocal_cli.detection.fitting.edge_profile import (
     sharp_profile,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.map_fit import MapFit
+from neurocal_cli.detection.fitting.map_fit import MapFit, WideMap
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single
-from neurocal_cli.detection.fitting.wide_map import WideMap
 from neurocal_cli.detection.medians import upper_median
 
 # Insensitive, except _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.

@@ -36,10 +36,22 @@ from neurocal_cli.detection.fitting.edge_fit import (
     moments,
     usual_stride,
 )
-from neurocal_cli.detection.fitting.edge_profile import half_widths
-from neurocal_cli.detection.fitting.grid_edges import ANCHOR, GridEdges, GridImage
+from neurocal_cli.detection.fitting.edge_profile import (
+    EdgeProfile,
+    edge_profile,
+    find_sharpening,
+    half_widths,
+)
 from neurocal_cli.detection.fitting.initial_fit import fit_initial, is_reliable, is_typical
-from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
+from neurocal_cli.detection.fitting.map_fit import (
+    MapFit,
+    Observations,
+    WideMap,
+    fit_map,
+    loss_of,
+    select_map,
+    wide_start,
+)
 from neurocal_cli.detection.fitting.shading import (
     Levels,
     LocalShading,
@@ -48,10 +60,8 @@ from neurocal_cli.detection.fitting.shading import (
     fit_shading,
     square_levels,
 )
-from neurocal_cli.detection.fitting.sharpening import EdgeProfile, edge_profile, find_sharpening
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
-from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
+from neurocal_cli.detection.fitting.strips import ANCHOR, GridEdges, GridImage, Lines, strip_pixels
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 
 # Insensitive: later stages correct the errors of earlier ones.

@@ -39,11 +39,10 @@ from neurocal_cli.detection.fitting.edge_profile import (
     response,
     sharp_profile,
 )
-from neurocal_cli.detection.fitting.grid_edges import GridImage
 from neurocal_cli.detection.fitting.grid_fit import LEAST_SCALE, STEPS, GridFit
 from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance
-from neurocal_cli.detection.fitting.strips import Lines, Single, grid_lines, packed, strip_pixels
+from neurocal_cli.detection.fitting.strips import GridImage, Lines, Single, grid_lines, packed, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 
 # Positions of the values of a fit: offset [px] and tilt [px over the half length] of the line along c, then

@@ -26,9 +26,8 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.edge_profile import Real, profile, response
 from neurocal_cli.detection.fitting.shading import Shading
-from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
 from neurocal_cli.detection.fitting.strips import Single
-from neurocal_cli.detection.local_inverse import LocalInverse
 
 # sigma, beyond which a pattern changes the light by less than 0.0002 half contrasts, and beyond which the
 # inner part of a marker with a border does not matter

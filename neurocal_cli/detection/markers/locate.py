@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.saddles import Image, grey_levels
+from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.identity.identify import Identified, Located
-from neurocal_cli.detection.identity.placement import NoBoardError, Placement
+from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.lattice import Placed, corners_of_tags, find_vertices, place
-from neurocal_cli.detection.markers.reading import USUAL, eight_bits, read_markers
+from neurocal_cli.detection.markers.reading import USUAL, read_markers
+from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import TagPlane

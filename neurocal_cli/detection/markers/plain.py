@@ -15,14 +15,18 @@ from neurocal_cli.detection.finding.saddles import interpolate
 from neurocal_cli.detection.fitting.batched_newton import LEAST_BLUR
 from neurocal_cli.detection.fitting.common_parameters import correlation
 from neurocal_cli.detection.fitting.edge_fit import usual_stride
-from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, erf_and_density
-from neurocal_cli.detection.fitting.grid_edges import GridImage
+from neurocal_cli.detection.fitting.edge_profile import (
+    RESPONSE_TERMS,
+    EdgeProfile,
+    edge_profile,
+    erf_and_density,
+    find_sharpening,
+)
 from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_again, fit_from, map_of_vertices
 from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
 from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, fit_shading, square_levels
-from neurocal_cli.detection.fitting.sharpening import EdgeProfile, edge_profile, find_sharpening
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import Lines, Strips, grid_lines, strip_pixels
+from neurocal_cli.detection.fitting.strips import GridImage, Lines, Strips, grid_lines, strip_pixels
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Appearance, Ink, without_ink
 from neurocal_cli.detection.medians import upper_median

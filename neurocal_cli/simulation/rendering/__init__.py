@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from neurocal_cli.simulation.rendering.layers import PlaneTruth, Truth, ground_truth
 from neurocal_cli.simulation.rendering.render import Rendered, render
 from neurocal_cli.simulation.rendering.scene import (
     Background,
@@ -15,7 +16,6 @@ from neurocal_cli.simulation.rendering.scene import (
     Sides,
     Target,
 )
-from neurocal_cli.simulation.rendering.truth import PlaneTruth, Truth, ground_truth
 
 __all__ = [
     "Background",

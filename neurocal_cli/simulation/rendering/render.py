@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.simulation.rendering.layers import Composition
+from neurocal_cli.simulation.rendering.layers import Composition, Truth, ground_truth
 from neurocal_cli.simulation.rendering.scene import Illumination, Scene, Sensor
-from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
 
 _TAIL = 5.7  # standard deviations at which the Gaussian is cut off; 1e-8 of the light is beyond
 _ROWS_AT_ONCE = 16  # rows processed at a time

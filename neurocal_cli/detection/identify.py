@@ -27,17 +27,19 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.lattice import PlacedCircles
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.identity.ends import End, board_ends, surrounded
-from neurocal_cli.detection.identity.placement import (
+from neurocal_cli.detection.markers.ink import Ink
+from neurocal_cli.detection.placement import (
     SYMMETRIC_BOARD,
+    End,
     NoBoardError,
     Placement,
     ambiguous,
+    board_ends,
     placements,
+    surrounded,
     trimmed,
     wrong_size,
 )
-from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.observations.board import Board, Plane, is_flat
 
 _ROUNDING = 1e-6  # greatest error of a motion that maps the board onto itself, relative to its extent

@@ -1,4 +1,4 @@
-"""Measure the centres of circles to the limit set by the pixel noise.
+"""Locate a grid of circles in an image, and measure their centres to the limit set by the pixel noise.
 
 The image of a circle's centre is not the centre of its ellipse: perspective moves it by up to a tenth of a
 pixel and more, lenses as well. So the outline is not fitted by an ellipse. A smooth map of the board gives
@@ -20,30 +20,144 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import PlacedCircles
-from neurocal_cli.detection.circles.outlines import CirclePixels, outline_pixels
+from neurocal_cli.detection.circles.lattice import PlacedCircles, find_blobs, place_circles
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     BatchFit,
+    FitPixels,
     LevelPrior,
     Linearised,
     ProfileShape,
     fit_batch,
     rows_for,
 )
-from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, profile
-from neurocal_cli.detection.fitting.grid_edges import GridImage
+from neurocal_cli.detection.fitting.edge_profile import (
+    RESPONSE_TERMS,
+    EdgeProfile,
+    edge_profile,
+    find_sharpening,
+    profile,
+)
 from neurocal_cli.detection.fitting.grid_fit import map_of_vertices
 from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
-from neurocal_cli.detection.fitting.sharpening import EdgeProfile, edge_profile, find_sharpening
-from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import Single, Strips
+from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
+from neurocal_cli.detection.fitting.strips import GridImage, Single, Strips, packed
+from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.grid import VERTEX, Grid, Measured
+from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.detection.placement import NoBoardError, Placement
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.board_kinds import CirclePlane
+
+_REACH = 4.0  # sigma on both sides of the outline
+_ROUGHLY = 1.5  # of that, for a first selection
+_ROOM = 0.5  # of the distance to the next circle; farther pixels may show it
+_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+_RADII = (0.6, 0.8, 1.0, 1.2, 1.4)  # of samples of the map around a circle, over its radius
+
+
+@frozen_dataclass(eq=False)
+class CirclePixels(FitPixels):
+    """Pixels around outlines, (N, M) float32 arrays."""
+
+    d: Single  # [px] distance from the outline, positive outside
+    u: Single  # normal of the outline
+    v: Single
+    bend: Single  # [1/px] half of its curvature
+
+
+def outline_pixels(
+    image: NDArray[np.float32],
+    at: SmoothMap,
+    places: Array,
+    radius: float,
+    blur: float,
+    apart: float,
+    shading: Shading | None,
+) -> CirclePixels:
+    """Gather the pixels around the outlines of circles at places (N, 2), padded to the same number.
+
+    `radius` and the distance `apart` of two circles are in the unit of the places, `blur` in px.
+    """
+    ring = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+    samples = np.concatenate([[[0.0, 0.0]], *(share * radius * ring for share in _RADII)])
+    seen, reach = at.at(places[:, None] + samples), _REACH * blur
+    middle = seen[:, 0]
+    outline = seen[:, 1 + 2 * len(_ANGLES) : 1 + 3 * len(_ANGLES)]
+    point, d, normal, bend, rho, band = _distances(seen, samples, radius, _around(outline, reach), reach)
+    band &= (np.abs(d) < reach) & (rho < _ROOM * apart)
+    framed = band & (point >= 0).all(axis=2) & (point < image.shape[::-1]).all(axis=2)
+    beyond = 1 - framed.sum(axis=1) / np.maximum(band.sum(axis=1), 1)
+    index, used = packed(framed, framed.sum(axis=1))
+    u, v, d, n_u, n_v, bend = (
+        x.reshape(-1)[index] for x in (*np.moveaxis(point, 2, 0), d, *np.moveaxis(normal, 2, 0), bend)
+    )
+    value: Single = image[np.where(used, v, 0).astype(int), np.where(used, u, 0).astype(int)]
+    gain: Single = np.ones_like(value)
+    if shading is not None:
+        off = ((u - middle[:, :1]).astype(np.float32), (v - middle[:, 1:]).astype(np.float32))
+        value, gain = shading.off(middle, *off, value)
+    columns: list[Single] = [np.where(used, x, 0).astype(np.float32) for x in (d, n_u, n_v, bend)]
+    return CirclePixels(value, gain, np.ones_like(value), used.astype(np.float32), beyond, *columns)
+
+
+def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels (N, M, 2) of a window for each outline (N, K, 2), and a mask of those near its box."""
+    low, high = np.floor(outline.min(axis=1) - reach), np.ceil(outline.max(axis=1) + reach) + 1
+    width, height = (high - low).max(axis=0).astype(int)
+    away = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    return low[:, None] + away, (away < (high - low)[:, None]).all(axis=2)
+
+
+def _distances(
+    seen: Array,
+    samples: Array,
+    radius: float,
+    window: tuple[Array, NDArray[np.bool_]],
+    reach: float,
+) -> tuple[Array, Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Pixels near outlines: themselves, distance, normal, half curvature, radius on the board, and a mask.
+
+    The map's inverse is a polynomial through its samples around the circle. All arrays are padded to the same
+    number of pixels, which the mask tells from the padding.
+    """
+    inverse = LocalInverse.of(seen, samples)
+
+    def nearer(foot: Array, point: Array) -> tuple[Array, Array, Array]:
+        """Distance from the outline, normal at a foot near it, and the radius there."""
+        a, b = inverse.at(foot)
+        au, av, bu, bv = inverse.slopes(foot)
+        rho = np.maximum(np.hypot(a, b), 1e-9)
+        slope = np.stack([a * au + b * bu, a * av + b * bv], axis=-1) / rho[..., None]
+        steep = np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)
+        n = slope / steep[..., None]
+        return ((point - foot) * n).sum(axis=2) + (rho - radius) / steep, n, rho
+
+    point, inside = window
+    d, n, rho = nearer(point, point)
+    near = inside & (np.abs(d) < _ROUGHLY * reach)
+    index, used = packed(near, near.sum(axis=1))
+    d, rho = (x.reshape(-1)[index] for x in (d, rho))
+    n, point = (x.reshape(-1, 2)[index] for x in (n, point))
+    foot = point
+    for _ in range(2):
+        foot = point - d[..., None] * n
+        d, n, _ = nearer(foot, point)
+    # Curvature of an ellipse with the shape of the map at the centre: M maps pixels to the board.
+    M = np.stack(inverse.slopes(seen[:, :1]), axis=-1).reshape(-1, 2, 2)
+    G = M.swapaxes(1, 2) @ M / radius**2
+    gradient = (foot - seen[:, :1]) @ G
+    length = np.maximum(np.hypot(gradient[..., 0], gradient[..., 1]), 1e-12)
+    tangent = np.stack([-gradient[..., 1], gradient[..., 0]], axis=-1) / length[..., None]
+    curvature = ((tangent @ G) * tangent).sum(axis=2) / length
+    return point, d, n, 0.5 * np.clip(curvature, 0, 2), rho, used
+
 
 _AROUND = 3  # found circles around one that was not recognised
 _ROUNDS = 3
@@ -222,3 +336,43 @@ def _shading(at: SmoothMap, places: Array, fit: BatchFit, good: NDArray[np.bool_
     variance = fit.covariance[good, 3, 3] + fit.covariance[good, 4, 4]
     dark, light = (Levels(place, mean + sign * contrast, variance) for sign in (-1, 1))
     return fit_shading(at.frame, dark, light)
+
+
+_ROUNDING = 1 / 12  # DN^2
+
+
+def locate_circles(board: Board, image: NDArray[np.generic]) -> Identified:
+    """Locate a board of circles.
+
+    Raises NoBoardError if it is not seen, or the part that is seen may be several parts.
+    """
+    plane = board.planes[0]
+    if len(board.planes) > 1 or not isinstance(plane, CirclePlane):
+        raise InputError("a board of circles has one plane; describe other planes in files of their own")
+    grey = eight_bits(image)
+    found: list[PlacedCircles] = []
+    problems = []
+    for light in (False, True):
+        try:
+            placed = place_circles(plane, find_blobs(255 - grey if light else grey))
+        except NoBoardError as error:
+            problems.append(str(error))
+            continue
+        if placed is not None:
+            found.append(replace(placed, light=light))
+    if not found:
+        usual = "no grid of circles detected; show the whole board, sharp and evenly lit"
+        raise NoBoardError(problems[0] if problems else usual)
+    # The gaps between circles are a lattice, too, of fewer places.
+    placed = max(found, key=lambda one: len(one.place))
+    pixels = np.full((plane.rows, plane.cols, 2), np.nan)
+    pixels[placed.place[:, 1], placed.place[:, 0]] = placed.centre
+    located = Located(Grid(pixels, 0), plane, Placement(0, ((1, 0), (0, 1)), (0, 0)), circles=placed)
+    return Identified((located,), placed.warnings)
+
+
+def measure_located(image: NDArray[np.generic], plane: CirclePlane, placed: PlacedCircles) -> Measured:
+    """Measure the circles that were located in an image."""
+    light = np.asarray(image, dtype=np.float32)
+    floor = _ROUNDING if image.dtype.kind in "iu" else (1e-5 * float(np.abs(light).max())) ** 2 + 1e-30
+    return measure_circles(light.max() - light if placed.light else light, plane, placed, floor)
