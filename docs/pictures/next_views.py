@@ -6,7 +6,7 @@ from style import HERE, SAMPLES
 
 from neurocal_cli import calibrate, read_points
 from neurocal_cli.calibration.advice import advise
-from neurocal_cli.commands.show.advised_views import draw_advice
+from neurocal_cli.commands.show.advice import draw_advice
 
 
 def main() -> None:

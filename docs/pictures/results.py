@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neurocal_cli.commands.show.simulation_plots import draw_rates, draw_simulation
+from neurocal_cli.commands.show.methods_report import draw_rates, draw_simulation
 from neurocal_cli.files.processes import usable_cores
 from neurocal_cli.simulation.comparison import study_noise
 from neurocal_cli.simulation.scenes import paper_scene

@@ -55,7 +55,7 @@ class Summarised:
 
     def _repr_html_(self) -> str:
         """HTML that a notebook shows: the parameters and the verdict."""
-        return str(late("commands.show.notebook", "notebook_html")(self))
+        return str(late("commands.show.results", "notebook_html")(self))
 
 
 class Presented(Summarised):

@@ -17,23 +17,24 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.screen import HelpContext, wrapped
 from neurocal_cli.commands.streams import (
     NEXT,
     TYPED,
+    HelpContext,
     debugging,
     one_line,
     set_verbosity,
     tell,
     tell_ending,
     waiting,
+    wrapped,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
 
 __all__ = ["neurocal"]
 
-# Each command is the function of this name in the module of this name; None: hidden. The summaries
-# stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
+# Each command is the function of this name in the module of this name, or in that of `_WITH`; None: hidden.
+# The summaries stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "advise": "Advise which views of the target to photograph next.",
     "batch": "Calibrate many data sets, and summarise the fleet.",
@@ -57,6 +58,7 @@ _SUMMARIES = {
     "undistort": "Remove the lens distortion from images and points.",
     "man": None,
 }
+_WITH = {"stereo": "rig", "target": "board"}
 
 
 class _LazyGroup(click.Group):
@@ -71,7 +73,8 @@ class _LazyGroup(click.Group):
         # All are loaded for a wrong name, so that click can suggest the nearest one.
         for name in [cmd_name] if cmd_name in _SUMMARIES else _SUMMARIES:
             if name not in self.commands:
-                self.add_command(getattr(import_module(f"{__name__}.{name}"), name), name)
+                module = import_module(f"{__name__}.{_WITH.get(name, name)}")
+                self.add_command(getattr(module, name), name)
         return self.commands.get(cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.preparation import plot_option, write_plot
 from neurocal_cli.commands.streams import ProgressBar, answer, suggest
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
         _advise_rig(root, count, plot, as_json)
         return
     from neurocal_cli.calibration.advice import advise as weigh
-    from neurocal_cli.commands.show.advice import advice_json, advice_lines
-    from neurocal_cli.commands.show.advised_views import draw_advice
+    from neurocal_cli.commands.show.advice import advice_json, advice_lines, draw_advice
     from neurocal_cli.files.calibration_yaml import calibration_from_field
 
     known = calibration_from_field(root)
@@ -71,8 +70,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
 def _advise_rig(root: Field, count: int, plot: str | None, as_json: bool) -> None:
     """Advise views that tie the cameras of a rig."""
     from neurocal_cli.calibration.rig.advice import advise_rig
-    from neurocal_cli.commands.show.advice import rig_advice_json, rig_advice_lines
-    from neurocal_cli.commands.show.advised_views import draw_rig_advice
+    from neurocal_cli.commands.show.advice import draw_rig_advice, rig_advice_json, rig_advice_lines
     from neurocal_cli.files.rig_yaml import rig_from_field
 
     rig = rig_from_field(root)

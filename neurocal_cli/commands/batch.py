@@ -264,7 +264,7 @@ class _Batch:
         """What changed since an earlier batch, by the names of job and camera."""
         if not former:
             return {}
-        from neurocal_cli.commands.batch_drift import Pair, compare
+        from neurocal_cli.commands.batch_run import Pair, compare
         from neurocal_cli.files.processes import usable_cores, work_off
 
         pairs = [
@@ -295,8 +295,7 @@ class _Batch:
 
     def _write(self, changes: dict[tuple[str, str], dict[str, Any]]) -> list[dict[str, Any]]:
         """Write the summary of what is done, at once, and return its rows."""
-        from neurocal_cli.commands.batch_rows import fleet_rows
-        from neurocal_cli.commands.show.fleet_page import fleet_page
+        from neurocal_cli.commands.show.fleet import fleet_page, fleet_rows
         from neurocal_cli.files.batch_files import format_fleet
         from neurocal_cli.files.writing import write_at_once
 
@@ -307,7 +306,7 @@ class _Batch:
 
     def _tell(self, rows: list[dict[str, Any]], as_json: bool) -> None:
         """Report what was done, and what stands out."""
-        from neurocal_cli.commands.batch_rows import drift_text
+        from neurocal_cli.commands.show.fleet import drift_text
 
         outcomes = self._outcomes
         failed = {name: one.problem for name, one in outcomes.items() if one.status != "done"}

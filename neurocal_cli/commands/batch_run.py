@@ -1,4 +1,4 @@
-"""Do one job of a batch, in a worker process: its commands, as they are typed, in a folder of its own."""
+"""What a worker process does for a batch: a job in a folder of its own, and the comparison of two cameras."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from collections.abc import Mapping
 from contextlib import suppress
 from contextvars import Context
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands import preparation
 from neurocal_cli.commands.batch_jobs import LOG, Job, Outcome, Words, parsed
-from neurocal_cli.commands.batch_rows import rows_of
+from neurocal_cli.commands.show.fleet import rows_of
 from neurocal_cli.commands.streams import captured, one_line, tell
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.batch_files import (
@@ -37,6 +38,9 @@ from neurocal_cli.files.batch_files import (
 )
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import all_or_none, write_at_once
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.drift import Drift
 
 # The working folder is that of the whole process, and so are some settings of libraries.
 _ONE_AT_A_TIME = threading.Lock()
@@ -200,3 +204,61 @@ def _run(words: Words, lines: list[str], summaries: list[dict[str, Any]]) -> tup
     lines += capture.lines
     summaries += capture.summaries
     return code, problem, machine
+
+
+@frozen_dataclass
+class Pair:
+    """An earlier and a new camera: the names of job and camera, and their files."""
+
+    name: str
+    camera: str
+    old: str
+    new: str
+
+
+def compare(pair: Pair) -> dict[str, Any]:
+    """What changed, as cells of the summary; the drift is "unknown" and the reason if that cannot be said."""
+    return Context().run(_compared, pair)
+
+
+def _compared(pair: Pair) -> dict[str, Any]:
+    from neurocal_cli.calibration.drift import find_drift
+    from neurocal_cli.files.calibration_yaml import read_calibration
+
+    try:
+        if not pair.camera:
+            return _in_image(find_drift(read_calibration(pair.old), read_calibration(pair.new)))
+        return _in_rigs(pair)
+    except NeurocalError as error:
+        return {"drift": f"unknown: {error}"}
+
+
+def _in_rigs(pair: Pair) -> dict[str, Any]:
+    """What changed in a camera of a rig, and in its pose relative to the first camera."""
+    from neurocal_cli.calibration.drift import find_drift
+    from neurocal_cli.calibration.rig.rig_drift import find_pose_drift
+    from neurocal_cli.files.rig_yaml import read_rig
+
+    old, new, name = read_rig(pair.old), read_rig(pair.new), pair.camera
+    if name not in old.cameras:
+        raise NeurocalError(f"{pair.old} has no camera {name}")
+    cells = _in_image(find_drift(old.cameras[name], new.cameras[name]))
+    if name == new.first:
+        return cells
+    moved = find_pose_drift(old, new, name)
+    return cells | {
+        "turn_rad": float(np.linalg.norm(moved.turn)),
+        "turn_std_rad": float(np.linalg.norm(moved.turn_std)),
+        "baseline_change": moved.baseline,
+        "baseline_change_std": moved.baseline_std,
+        "pose_share": moved.share,
+    }
+
+
+def _in_image(found: Drift) -> dict[str, Any]:
+    return {
+        "drift": "same",  # or what has changed, which depends on the number of cameras
+        "drift_px": found.rms_px,
+        "drift_std_px": found.rms_std,
+        "drift_share": found.share,
+    }

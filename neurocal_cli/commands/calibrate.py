@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import click
 
-from neurocal_cli.commands import options, preparation
+from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import Plots, files_of, html_option, panel_option, write_page, write_plots
+from neurocal_cli.commands.preparation import Plots, files_of, panel_option, write_plots
+from neurocal_cli.commands.report import html_option, write_page
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.streams import ProgressBar, concluding, suggest, warn
 
@@ -16,7 +17,7 @@ _STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 @click.command(cls=options.Command)
 @options.points
 @estimation_options()
-@options.board_of_corners
+@boards.board_of_corners
 @options.camera_name
 @panel_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option

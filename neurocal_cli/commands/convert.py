@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options, preparation
+from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError, plural
 from neurocal_cli.files.reading import repeatable_stdin
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     "If the format does not have the distortion model, write the nearest camera that it has.",
     without="refuse",
 )
-@options.board("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
+@boards.board("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
 @options.count(
     "--image-size",
     "W H",
@@ -95,7 +95,7 @@ def convert(
     distortion: str | None,
     what: str | None,
     force: bool,
-    board: options.BoardOptions,
+    board: boards.BoardOptions,
     image_size: tuple[int, int] | None,
     focal_length: float | None,
     crop_factor: float | None,

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
-from neurocal_cli.commands.requested_board import (
+from neurocal_cli.commands import boards, options, preparation
+from neurocal_cli.commands.boards import (
     board_in_images,
     check_size,
     compare_markers,
     complain_of,
     described_board,
 )
+from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
     debugging,
@@ -56,7 +56,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
     nargs=-1,
     required=True,
 )
-@options.board("Unit of --square. A board file names its own unit.")
+@boards.board("Unit of --square. A board file names its own unit.")
 @options.choice(
     "--points",
     "midpoints edges vertices",
@@ -106,7 +106,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
 @options.output("POINTS.csv", "Write the points to this file.")
 def detect(
     images: tuple[str, ...],
-    board: options.BoardOptions,
+    board: boards.BoardOptions,
     points: str,
     gamma: float | None,
     overlay: str | None,
@@ -212,7 +212,7 @@ class _Request:
     """What is asked for; the board may have to be found first."""
 
     board: Board | None
-    described: options.BoardOptions
+    described: boards.BoardOptions
     points: Points
     gamma: float | None
     overlay: bool

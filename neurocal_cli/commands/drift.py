@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.preparation import plot_option, write_plot
 from neurocal_cli.commands.streams import answer, note
 from neurocal_cli.errors import FormatError, InputError
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import Plots, files_of, panel_option, write_plots
+from neurocal_cli.commands.preparation import Plots, files_of, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.streams import answer, first_of, note, suggest, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
@@ -174,14 +174,15 @@ def camera(
     from neurocal_cli.calibration.evaluation import evaluate_camera
     from neurocal_cli.calibration.verdict.assessment import assess
     from neurocal_cli.calibration.verdict.given_points import judged_by_points
-    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
-    from neurocal_cli.commands.show.drift_report import drift_json, since_line
-    from neurocal_cli.commands.show.plane_report import (
+    from neurocal_cli.commands.show.camera_report import (
+        evaluation_json,
+        evaluation_tables,
         plane_json,
         plane_tables,
         position_tables,
         positions_json,
     )
+    from neurocal_cli.commands.show.drift_report import drift_json, since_line
     from neurocal_cli.commands.show.text import tabulated, verdict_lines
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
@@ -314,8 +315,8 @@ def stereo(
     if at is not None and rig is None:
         raise UsageError("--at needs a rig; give one that neurocal stereo wrote")
     space = _errors_at(at, rig)
-    from neurocal_cli.commands.show.plane_report import plane_json, plane_tables
-    from neurocal_cli.commands.show.stereo_report import (
+    from neurocal_cli.commands.show.camera_report import plane_json, plane_tables
+    from neurocal_cli.commands.show.rig_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
         views_alone,
@@ -382,7 +383,7 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     named = [named_file(word) for word in points]
     preparation.check((file, *(name for _, name in named)))
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
-    from neurocal_cli.commands.show.plane_report import plane_json, plane_tables
+    from neurocal_cli.commands.show.camera_report import plane_json, plane_tables
     from neurocal_cli.commands.show.rig_report import rig_evaluation_json, rig_evaluation_tables
     from neurocal_cli.commands.show.text import tabulated, verdict_lines
     from neurocal_cli.files.rig_points import read_rig_points

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.preparation import plot_option, write_plot
 from neurocal_cli.commands.streams import (
     ProgressBar,
     answer,
@@ -145,8 +145,7 @@ def fit(
     preparation.compute_in_one_thread()
     preparation.check(points, (output,), plots=(plot,), as_json=as_json)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
-    from neurocal_cli.commands.show.zoom_plots import draw_lens
-    from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
+    from neurocal_cli.commands.show.zoom_report import draw_lens, lens_json, lens_report
     from neurocal_cli.files.lens_files import read_lens_data, write_lens
 
     data = noted(read_lens_data, points)
@@ -272,8 +271,7 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
         return
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.judgement import judge_lens
-    from neurocal_cli.commands.show.zoom_plots import draw_evaluation
-    from neurocal_cli.commands.show.zoom_report import evaluation_json, evaluation_report
+    from neurocal_cli.commands.show.zoom_report import draw_evaluation, evaluation_json, evaluation_report
     from neurocal_cli.files.lens_files import read_lens, read_lens_points
 
     learnt = read_lens(lens_file)

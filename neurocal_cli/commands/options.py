@@ -9,21 +9,19 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
-from functools import partial, wraps
+from functools import wraps
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
 from click.types import FloatParamType
 
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.commands.screen import HelpContext
-from neurocal_cli.commands.streams import note
+from neurocal_cli.commands.streams import HelpContext, note
 from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.reading import detect_line
 
 if TYPE_CHECKING:
-    from neurocal_cli.observations.board import Board
+    pass
 
 F = TypeVar("F", bound=Callable[..., Any])
 Named = tuple[tuple[str, str], ...]  # values of an option NAME=VALUE that can be repeated
@@ -64,6 +62,7 @@ _GROUPS = {
     "Research": "method trainer starts seed epochs rate rate_gamma training hidden",
 }
 _NOISE = re.compile(r"default: \((none|no|required)\)|(\S+<=?)?x(<=?|>=?)\S+").fullmatch
+
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 """Those of `simulation.comparison`, which a test compares."""
@@ -313,128 +312,6 @@ def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], 
     usual = {"required": True} if required else {"default": "-"}
     without = "required" if required else "standard output"
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
-
-
-@frozen_dataclass
-class BoardOptions:
-    """The values of the options of a board, whose file is not read yet."""
-
-    file: str | None
-    cols: int | None
-    rows: int | None
-    square: float | None
-    unit: str | None
-
-    def read(self) -> Board | None:
-        """The board; None if no option describes one, a UsageError if they contradict each other."""
-        from neurocal_cli.observations.board import Board
-
-        self.check_unit()
-        cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
-        if self.file is not None:
-            from neurocal_cli.files.board_kinds import short_board
-
-            if (cols, rows, square) == (None,) * 3:
-                short = short_board(self.file, "mm" if unit is None else unit)
-                if short is not None:
-                    return short
-            if (cols, rows, square, unit) != (None,) * 4:
-                raise UsageError(
-                    "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
-                )
-            from neurocal_cli.files.board_yaml import read_board
-
-            return read_board(self.file)
-        if (cols, rows, square, unit) == (None,) * 4:
-            return None
-        if cols is None or rows is None or square is None:
-            given = {"--cols": cols, "--rows": rows, "--square": square}
-            missing = " and ".join(name for name, value in given.items() if value is None)
-            raise UsageError(f"{missing} missing; give --cols, --rows and --square, or --board BOARD.yaml")
-        return Board.single(cols, rows, square, "mm" if unit is None else unit)
-
-    def read_or_unknown(self) -> Board | None:
-        """The board, for a command that finds its size itself: None without a size; the square may lack."""
-        if self.file is not None:
-            return self.read()
-        counts, (square, unit) = self.counts, self.side
-        if not counts:
-            return None
-        from neurocal_cli.observations.board import Board
-
-        return Board.single(*counts, square, unit)
-
-    @property
-    def counts(self) -> tuple[int, int] | tuple[()]:
-        """Columns and rows; none if neither is given."""
-        if self.cols is not None and self.rows is not None:
-            return self.cols, self.rows
-        if self.cols is None and self.rows is None:
-            return ()
-        missing = "--rows" if self.rows is None else "--cols"
-        raise UsageError(f"{missing} is missing; give both --cols and --rows, or neither")
-
-    @property
-    def side(self) -> tuple[float, str]:
-        """Side of a square and its unit; if the side is unknown, it is the unit."""
-        self.check_unit()
-        if self.square is not None:
-            return self.square, "mm" if self.unit is None else self.unit
-        if self.unit is not None:
-            raise UsageError("--unit is the unit of --square, which is missing; give both")
-        return 1.0, "squares"
-
-    @property
-    def is_file(self) -> bool:
-        """Whether the board is described by a file, not in short."""
-        from neurocal_cli.files.board_kinds import SHORT_FORMS
-
-        return self.file is not None and self.file.partition(":")[0] not in SHORT_FORMS
-
-    def check_unit(self) -> None:
-        """Refuse a unit that cannot be stored in a file, with a UsageError."""
-        unit = self.unit
-        if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
-            raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")
-
-
-_BOARD_FILE = (
-    "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
-    "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
-    "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], circles:COLSxROWS:DISTANCE[:DIAMETER], "
-    "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
-    "and ROWS count squares, tags or circles; of a chessboard, inner vertices."
-)
-
-
-def board_of_corners(command: F) -> F:
-    """Add ``--board``, for points of other programs without their places, a command's keyword ``board``."""
-    what = f"Board of corners whose file does not have their places, such as mrcal's. {_BOARD_FILE}"
-    return path("--board", "BOARD.yaml", what)(command)
-
-
-def named_board(name: str | None) -> Board | None:
-    """The board of ``--board``, a file or a short form; None without."""
-    return BoardOptions(name, None, None, None, None).read() if name else None
-
-
-def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
-    """Add the options of `BoardOptions`, a command's keyword ``board``."""
-    size = partial(count, without="none", least=2, most=1000)
-    added = (
-        path("--board", "BOARD.yaml", _BOARD_FILE, to="file"),
-        size("--cols", "C", "Number of inner vertices in a row of the board."),
-        size("--rows", "R", "Number of rows of inner vertices."),
-        number(
-            "--square",
-            "S",
-            "Side length of a square, or of a tag, or the distance of circles.",
-            without="none",
-            positive=True,
-        ),
-        click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
-    )
-    return collected(BoardOptions, added, "board")
 
 
 camera_name = click.option(

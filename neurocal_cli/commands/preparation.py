@@ -1,20 +1,23 @@
-"""What commands do before their work: check inputs and outputs, and read points and known cameras."""
+"""What commands do around their work: check inputs and outputs, read points and cameras, draw pictures."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.pages import check_plot
-from neurocal_cli.commands.screen import is_terminal
-from neurocal_cli.commands.streams import note, say, warn
+import click
+
+from neurocal_cli.commands import boards, options
+from neurocal_cli.commands.options import F
+from neurocal_cli.commands.show.figure import check_available
+from neurocal_cli.commands.streams import ProgressBar, is_terminal, note, say, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
-from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back
+from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
@@ -22,6 +25,11 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
+
+
+_PICTURES = (".png", ".pdf", ".svg")
+
+Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 
 
 def check(
@@ -106,7 +114,7 @@ def given_points(*names: str, board: str | None = "") -> Correspondences:
             from neurocal_cli.files.exchange.corners import BOARD_ADVICE, read_corners
 
             advice = POINTS.instead.removeprefix("; ") if board == "" else BOARD_ADVICE
-            points = read_corners(names, options.named_board(board), notes, what="points", advice=advice)
+            points = read_corners(names, boards.named_board(board), notes, what="points", advice=advice)
         if points is None:
             points = read_points(names, notes=notes)
     note(*notes, *ids_at_two_places(points))
@@ -172,3 +180,65 @@ def warn_of_poor(rig: StereoRig | Rig, so: str = "") -> None:
     verdict = rig.verdict
     if verdict is not None and verdict.word == "poor":
         warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
+
+
+def plot_option(what: str) -> Callable[[F], F]:
+    """Add ``--plot``, a picture of the result; see `check_plot`."""
+    return options.path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
+
+
+def panel_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
+    """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
+
+    def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
+        plots: list[tuple[str | None, str]] = []
+        for word in words:
+            panel, equals, file = word.partition("=")
+            if equals and panel.isalpha() and panel not in panels:
+                raise click.BadParameter(
+                    f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a "
+                    "file of this name"
+                )
+            plots.append((panel, file) if equals and panel in panels else (None, word))
+        return tuple(plots)
+
+    return click.option(
+        "--plot",
+        "plots",
+        metavar="[PANEL=]FILE.png",
+        multiple=True,
+        callback=parse,
+        show_default="none",
+        help=f"Plot {what} to this .png, .pdf or .svg file: all panels on one page, or one of them: "
+        f"{', '.join(panels)}. It can be repeated.",
+    )
+
+
+def check_plot(plot: str | None) -> None:
+    """Refuse a picture that cannot be drawn, before any work is done."""
+    if plot is None:
+        return
+    if not plot.lower().endswith(_PICTURES):
+        raise UsageError(
+            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
+        )
+    check_available()
+
+
+def files_of(plots: Plots) -> list[str]:
+    """The files of pictures."""
+    return [file for _, file in plots]
+
+
+def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write all pictures of a subject; see `write_plot`."""
+    for panel, file in plots:
+        write_plot(file, partial(draw, panel=panel), *subject)
+
+
+def write_plot(file: str | None, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write a picture of a subject, of the `kind` that its name ends in, unless there is none."""
+    if file is None:
+        return
+    with ProgressBar(f"drawing {file}"):
+        write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))

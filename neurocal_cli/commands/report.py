@@ -1,4 +1,4 @@
-"""``neurocal report``: a result as one HTML page."""
+"""``neurocal report`` and the option ``--html``: a result as one HTML page."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note, suggest
+from neurocal_cli.commands.streams import TYPED, note, suggest
 from neurocal_cli.errors import UsageError
-from neurocal_cli.files.image_files import photographs_of
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.files.tree_fields import Field
 
 _MOST_BYTES = 1_400_000  # of all photographs; encoded as text they take a third more
@@ -74,6 +75,33 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     suggest(output, "open {} in a browser")
 
 
+html_option = options.path(
+    "--html",
+    "REPORT.html",
+    "Also write the page that `neurocal report` makes, with this command and the SHA-256 of its inputs.",
+)
+
+
+def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs: str | None) -> None:
+    """Write the page about a result from these input files; does nothing without a name."""
+    if html is None:
+        return
+    import hashlib
+    import shlex
+
+    from neurocal_cli.commands.show.html_page import Origin, versions
+    from neurocal_cli.commands.show.html_reports import page_of
+
+    files = {}
+    for name in inputs:
+        if name is not None and name != "-":  # what came through a pipe is gone
+            data, source = read_bytes(name)
+            files[source] = hashlib.sha256(data).hexdigest()
+    typed = click.get_current_context().meta.get(TYPED, ())
+    origin = Origin(files, shlex.join(("neurocal", *typed)), versions())
+    write_whole(html, page_of(result, origin))
+
+
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
     from neurocal_cli.commands.show.html_page import Origin
@@ -117,6 +145,7 @@ def _versions(root: Field) -> dict[str, str]:
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
     """Thumbnails of the views' photographs, for the page."""
+    from neurocal_cli.files.image_files import photographs_of
     from neurocal_cli.files.images import thumbnails
 
     views = calibration.points.view_names

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.preparation import plot_option, write_plot
 from neurocal_cli.commands.streams import ProgressBar, answer, note
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
 from neurocal_cli.files.writing import make_folder, write_whole
@@ -199,8 +199,12 @@ def simulate(
     levels = sorted(set(sigma))
     if save is not None:
         _save(scene, save, levels, seed, images)
-    from neurocal_cli.commands.show.methods_report import simulation_json, simulation_tables, text_of
-    from neurocal_cli.commands.show.simulation_plots import draw_simulation
+    from neurocal_cli.commands.show.methods_report import (
+        draw_simulation,
+        simulation_json,
+        simulation_tables,
+        text_of,
+    )
     from neurocal_cli.simulation.comparison import study_noise
 
     with ProgressBar() as progress:
@@ -261,8 +265,7 @@ def _starts(
 
 
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
-    from neurocal_cli.commands.show.methods_report import rates_json, rates_tables, text_of
-    from neurocal_cli.commands.show.simulation_plots import draw_rates
+    from neurocal_cli.commands.show.methods_report import draw_rates, rates_json, rates_tables, text_of
     from neurocal_cli.simulation.starts import study_rates
 
     with ProgressBar() as progress:
@@ -286,8 +289,7 @@ def _rig(
         raise UsageError(f"--rig {words}: give the layout and the number of cameras, such as ring:8")
     import numpy as np
 
-    from neurocal_cli.commands.show.methods_report import text_of
-    from neurocal_cli.commands.show.rig_report import rig_study_json, rig_study_table
+    from neurocal_cli.commands.show.methods_report import rig_study_json, rig_study_table, text_of
     from neurocal_cli.simulation.rigs import study_rig
 
     with ProgressBar() as progress:

@@ -1,23 +1,29 @@
-"""``neurocal triangulate``: pixels of both cameras in, points in space out."""
+"""``neurocal triangulate``: pixels of two cameras or more in, points in space out; of one, on a plane."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import end_waiting, note, noted, print_summary, say, warn
-from neurocal_cli.errors import UsageError, plural
+from neurocal_cli.errors import InputError, UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import Triangulated
-    from neurocal_cli.files.measurement_csv import Matches
+    from neurocal_cli.camera.measured import PlanePoints
+    from neurocal_cli.files.measurement_csv import Batch, Matches
+
+T = TypeVar("T")
 
 _USUAL_SIGMA = 0.5  # px; default for a rig without points
 _LARGEST_SIGMA = 1e6  # px; no image is that large
@@ -129,9 +135,7 @@ def triangulate(
         if len(inputs) != 2:
             raise UsageError("--plane is of a single camera; give CAMERA.yaml PIXELS.csv")
         options.note_unused("with --plane", "epipolar_limit")
-        from neurocal_cli.commands.on_plane import points_on_plane
-
-        points_on_plane(inputs[0], inputs[1], plane, sigma, as_json, output)
+        _on_plane(inputs[0], inputs[1], plane, sigma, as_json, output)
         return
     if len(inputs) == 2 and _of_many(inputs[0], inputs[1]):
         _triangulate_many(inputs[0], inputs[1], sigma, epipolar_limit, as_json, output)
@@ -143,23 +147,80 @@ def triangulate(
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
     from neurocal_cli.files.measurement_csv import format_space_points, read_matches
 
-    if sigma is None and math.isnan(rig.sigma):
-        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-        sigma = _USUAL_SIGMA
-    elif sigma is None:
-        sigma = rig.sigma
+    sigma = _sigma_of(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
-    notes: list[str] = []
     tally = _Tally(rig, limit)
-    # Read the first rows before the output is opened, so that errors in the header leave it untouched.
-    matches = read_matches(inputs[-1], notes)
-    matches = chain([next(matches)], matches)
-    note(*notes)
+    matches = _begun(read_matches, inputs[-1])
     end_waiting()
     write_chunks(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
     tally.tell(as_json)
+
+
+def _sigma_of(rig: Rig | StereoRig) -> float:
+    """The noise of a rig's own points, or what is usual if it does not state any."""
+    if not math.isnan(rig.sigma):
+        return rig.sigma
+    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+    return _USUAL_SIGMA
+
+
+def _begun(read: Callable[[str, list[str]], Iterator[T]], file: str) -> Iterator[T]:
+    """Batches of a file, the first of which is read now, so that errors there leave the output untouched."""
+    notes: list[str] = []
+    batches = read(file, notes)
+    batches = chain([next(batches)], batches)
+    note(*notes)
+    return batches
+
+
+def _on_plane(camera: str, pixels: str, view: str, sigma: float | None, as_json: bool, output: str) -> None:
+    """Convert pixels to points on the plane of a view's target, and say how certain they are."""
+    import numpy as np
+
+    from neurocal_cli.calibration.verdict.findings import two_digits
+    from neurocal_cli.files.calibration_yaml import read_calibration
+    from neurocal_cli.files.measurement_csv import format_plane_points, read_pixels
+
+    calibration = read_calibration(camera)
+    calibration.pose_of(view)
+    if sigma is None and not np.isfinite(calibration.sigma):
+        raise InputError(f"{camera} does not say how accurate its pixels are; give --sigma")
+    sigma = calibration.sigma if sigma is None else sigma
+    verdict = calibration.verdict
+    if verdict is not None and verdict.word == "poor":
+        warn(f"the calibration is poor: {'; '.join(verdict.reasons[:1])}; points may be far off")
+    if calibration.points.undistorted:
+        note("the camera was calibrated from undistorted points; undistort its pixels alike")
+    batches = _begun(read_pixels, pixels)
+    missed, variances = 0, np.zeros((0, 2))
+
+    def located(batches: Iterator[Batch]) -> Iterator[tuple[PlanePoints, NDArray[Any] | None]]:
+        nonlocal missed, variances
+        for seen, labels in batches:
+            found = calibration.on_plane(seen, view, sigma)
+            missed += int((~found.seen).sum())
+            of_pixel = np.trace(found.by_pixel, axis1=1, axis2=2)
+            known = found.by_calibration
+            of_camera = np.full(len(seen), np.nan) if known is None else np.trace(known, axis1=1, axis2=2)
+            variances = np.concatenate([variances, np.column_stack([of_camera, of_pixel])[found.seen]])
+            yield found, labels
+
+    end_waiting()
+    write_chunks(output, format_plane_points(located(batches), view=view, unit=calibration.unit, sigma=sigma))
+    of_camera, of_pixel = np.sqrt(np.median(variances, axis=0)).tolist() if len(variances) else [np.nan] * 2
+    if as_json:
+        parts = {"calibration": of_camera, "pixels": of_pixel}
+        print_summary({"n_points": len(variances) + missed, "n_behind": missed, "std": parts})
+        return
+    told = [plural(len(variances) + missed, "point")]
+    told += [f"{missed} of them not on the plane in front of the camera"] if missed else []
+    if np.isfinite(of_pixel):
+        shares = [f"{two_digits(of_pixel)} {calibration.unit} by the pixels"]
+        shares += [f"{two_digits(of_camera)} by the calibration"] if np.isfinite(of_camera) else []
+        told.append(f"std {' and '.join(shares)}")
+    say(", ".join(told))
 
 
 def _of_many(rig: str, matches: str) -> bool:
@@ -182,9 +243,7 @@ def _triangulate_many(
     rig = read_rig(file)
     preparation.warn_of_poor(rig, "; points in space may be far off")
     seen = noted(read_sightings, matches)
-    if sigma is None and math.isnan(rig.sigma):
-        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-    sigma = sigma or (_USUAL_SIGMA if math.isnan(rig.sigma) else rig.sigma)
+    sigma = _sigma_of(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if limit is None else limit
     found = triangulate_many(rig, seen.point, seen.camera, seen.pixels, limit=limit)
     names = list(rig.cameras)

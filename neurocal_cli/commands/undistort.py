@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.screen import is_terminal
 from neurocal_cli.commands.streams import (
     each_of,
+    is_terminal,
     note,
     note_once,
     print_summary,

@@ -26,8 +26,7 @@ from neurocal_cli.calibration.advice import (
     worst_std,
 )
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.commands.show.advice import advice_lines
-from neurocal_cli.commands.show.advised_views import board_of, draw_advice
+from neurocal_cli.commands.show.advice import advice_lines, board_of, draw_advice
 from neurocal_cli.errors import InputError
 
 MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")

@@ -21,10 +21,9 @@ from support.sessions import camera, session
 
 from neurocal_cli import write_points
 from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
-from neurocal_cli.commands.batch_drift import Pair, compare
 from neurocal_cli.commands.batch_jobs import Job, Outcome
-from neurocal_cli.commands.batch_rows import drift_text, fleet_rows, of_one_kind
-from neurocal_cli.commands.show.fleet_page import fleet_page
+from neurocal_cli.commands.batch_run import Pair, compare
+from neurocal_cli.commands.show.fleet import drift_text, fleet_page, fleet_rows, of_one_kind
 from neurocal_cli.files.batch_files import publish, work_folder
 
 QUICK = ("--set", "distortion=none", "--set", "target=given", "--set", "outliers=keep")

@@ -12,7 +12,7 @@ from support.command_line import run
 from support.marked import marked_scene
 
 from neurocal_cli import read_board
-from neurocal_cli.commands.requested_board import another_size
+from neurocal_cli.commands.boards import another_size
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.files.board_yaml import board_line

@@ -384,9 +384,9 @@ def test_the_remedy_of_the_commonest_reason_is_told_once(folder: Path) -> None:
 def test_a_board_that_most_images_contradict_is_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from neurocal_cli.commands import requested_board
+    from neurocal_cli.commands import boards
 
-    monkeypatch.setattr(requested_board, "_shown", lambda outcome: (8, 5))
+    monkeypatch.setattr(boards, "_shown", lambda outcome: (8, 5))
     result = detect(folder, *BOARD)
     assert (result.exit_code, result.stdout) == (1, "")
     assert "most images show 8 x 5 inner vertices, and 9 x 6 were asked for; give --cols 8" in result.stderr

@@ -177,7 +177,7 @@ def test_help_needs_no_library(words: list[str]) -> None:
 
 def test_the_help_of_the_group_loads_no_command() -> None:
     own = {name for name in loaded_modules("--help") if name.startswith("neurocal_cli.commands.")}
-    assert own == {"neurocal_cli.commands.screen", "neurocal_cli.commands.streams"}
+    assert own == {"neurocal_cli.commands.streams"}
 
 
 def test_the_package_runs_as_a_module() -> None:

@@ -17,7 +17,7 @@ from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli import Board, read_image
-from neurocal_cli.commands.requested_board import _shown, another_size
+from neurocal_cli.commands.boards import _shown, another_size
 from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from support.places import PROJECT, SAMPLES
 from support.slow_cases import slow_but
 
-from neurocal_cli.commands import screen
-from neurocal_cli.commands.screen import drawn_on, wrapped
+from neurocal_cli.commands import streams
 from neurocal_cli.commands.show.text import align
+from neurocal_cli.commands.streams import drawn_on, wrapped
 
 pty = pytest.importorskip("pty")
 
@@ -200,7 +200,7 @@ def test_elsewhere_text_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.Monke
     with (tmp_path / "log").open("w") as stream:
         assert wrapped(long, stream) == long
         with drawn_on(stream):
-            assert screen.table_width() is None
+            assert streams.table_width() is None
     assert wrapped(long, None) == long
     assert wrapped(long, _Terminal()) == long  # type: ignore[arg-type]  # of unknown width
 

@@ -15,13 +15,13 @@ from neurocal_cli.calibration.other_methods.nonlinear import nonlinear
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.methods_report import (
+    draw_rates,
     noise_json,
     rates_json,
     rates_tables,
     simulation_tables,
     text_of,
 )
-from neurocal_cli.commands.show.simulation_plots import draw_rates
 from neurocal_cli.commands.streams import for_json
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.observations.board import Board

@@ -1,19 +1,35 @@
-"""Advice as text and as JSON."""
+"""Advice as text, as JSON, and as pictures of the board as it should be seen."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from neurocal_cli.calibration.advice import Advice, Candidate
-from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.rig.advice import RigAdvice
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import two_digits
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.show.camera_panels import outline_of
+from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
 from neurocal_cli.commands.show.text import printable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _ACROSS = ("far left", "left", "middle", "right", "far right")
 _DOWN = ("very top", "top", "middle", "bottom", "very bottom")
 _SIDES = ("right", "lower right", "lower", "lower left", "left", "upper left", "upper", "upper right")
+_MOST_DOTS = 4000
+_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # of a square
+_HALF = {"h": (0.5, 0.0), "v": (0.0, 0.5)}  # from a vertex to the mid-point of an edge [squares]
+_PIECES = 12  # of each side of an outline
 
 
 def advice_lines(advice: Advice, verdict: Verdict | None) -> list[str]:
@@ -113,3 +129,105 @@ def advice_json(advice: Advice) -> dict[str, Any]:
             for view, after in zip(advice.views, advice.after, strict=True)
         ],
     }
+
+
+def draw_advice(advice: Advice, calibration: Calibration, kind: str = "png") -> bytes:
+    """Draw each view that is advised for a camera (png, pdf or svg).
+
+    Raises
+    ------
+    NeurocalError
+        matplotlib is not installed.
+    """
+    views = [(view, f"then {after:.3g} px") for view, after in zip(advice.views, advice.after, strict=True)]
+    title = f"Views to take next; now {advice.before:.3g} px. The thick side is near."
+    return draw_views(calibration, views, title, kind)
+
+
+def draw_rig_advice(advice: RigAdvice, rig: Rig, kind: str = "png") -> bytes:
+    """Draw each view of the first advised pair of cameras, in the image of the first of them."""
+    cameras = advice.views[0].cameras
+    ties = [tie for tie in advice.views if tie.cameras == cameras]
+    (first, second), unit = map(plain, cameras), plain(advice.unit)
+    views = [(tie.view, f"then {tie.after:.3g} {unit}") for tie in ties]
+    title = f"Views for {first} and {second}, in the image of {first}; now {ties[0].before:.3g} {unit}"
+    return draw_views(rig.cameras[cameras[0]], views, title, kind)
+
+
+def draw_views(
+    calibration: Calibration, views: Sequence[tuple[Candidate, str]], title: str, kind: str
+) -> bytes:
+    """Draw views, each with a text, over the points of the views that a camera has taken so far."""
+    assert calibration.image_size is not None
+    width, height = calibration.image_size
+    columns = min(2, len(views))
+    rows = -(-len(views) // columns)
+    squares, rim = board_of(calibration)
+
+    def draw(made: Figure) -> None:
+        places = made.subplots(rows, columns, squeeze=False).ravel()
+        pixels = calibration.points.pixels[:: max(1, len(calibration.points) // _MOST_DOTS)]
+        for axes in places[len(views) :]:
+            axes.set_axis_off()
+        for number, (axes, (view, text)) in enumerate(zip(places, views, strict=False), start=1):
+            axes.plot(*pixels.T, ".", color="0.8", markersize=2)
+            _draw_view(axes, view, calibration, squares, rim)
+            style(axes, f"{number}: {text}")
+            axes.spines[["top", "right"]].set_visible(True)
+            axes.set(
+                xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xticks=[], yticks=[]
+            )
+        made.suptitle(title)
+
+    each = 3.1 if columns > 1 else 5.0
+    return picture(draw, (columns * each, rows * (each * height / width + 0.25) + 0.3), 0.05, kind)
+
+
+def board_of(calibration: Calibration) -> tuple[Array, Array]:
+    """Corners (n, 4, 3) of a chessboard's dark squares, and its rim (m, 3), closed.
+
+    Only the ids of mid-points tell the squares. Other targets have none, and the rim of their points.
+    """
+    points = calibration.points
+    world, first = np.unique(points.world, axis=0, return_index=True)
+    ids: list[str] = [] if points.point is None else np.asarray(points.point)[first].tolist()
+    found = [re.fullmatch(r"(h|v):(-?\d+):(-?\d+)", name) for name in ids]
+    places = [np.array([int(m[2]), int(m[3])]) + _HALF[m[1]] for m in found if m is not None]
+    if not places or len(places) < len(world):
+        corners = outline_of(world)
+        return np.empty((0, 4, 3)), _closed(corners) if len(corners) < len(world) else np.empty((0, 3))
+    grid = np.column_stack([places, np.ones(len(places))])
+    to_world = np.linalg.lstsq(grid, world, rcond=None)[0]  # the plane of a board that is bent
+    columns, rows = grid[:, :2].max(axis=0).astype(int) + 1
+    dark = [(c, r) for c in range(-1, columns) for r in range(-1, rows) if (c + r) % 2 == 0]
+    rim = _CORNERS * (columns + 1, rows + 1) - 1
+    squares = np.array(dark)[:, None] + _CORNERS
+    return np.insert(squares, 2, 1, axis=2) @ to_world, _closed(np.insert(rim, 2, 1, axis=1) @ to_world)
+
+
+def _closed(corners: Array) -> Array:
+    """The sides of a polygon, each in pieces, so that a lens may bend them."""
+    share = np.linspace(0, 1, _PIECES, endpoint=False)[:, None]
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    return np.vstack([*((1 - share) * a + share * b for a, b in sides), corners[:1]])
+
+
+def _draw_view(axes: Axes, view: Candidate, calibration: Calibration, squares: Array, rim: Array) -> None:
+    """Draw the board of a view, with an outline that is the thicker the nearer it is."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    def seen(world: Array) -> Array:
+        return calibration.camera.project(view.pose.to_camera(world))[0]
+
+    if len(squares):
+        polygons = seen(squares.reshape(-1, 3)).reshape(squares.shape[0], 4, 2)
+        axes.add_collection(PolyCollection(list(polygons), facecolor=INK, alpha=0.75, linewidth=0))
+    else:
+        axes.plot(*seen(calibration.points.world).T, ".", color=INK, markersize=3)
+    if len(rim):
+        depth, pixels = view.pose.to_camera(rim)[:, 2], seen(rim)
+        near = (depth.max() - depth) / max(float(np.ptp(depth)), 0.05 * float(depth.max()))
+        pieces = np.stack([pixels[:-1], pixels[1:]], axis=1)
+        axes.add_collection(
+            LineCollection(list(pieces), linewidths=1 + 4 * near[1:], colors=ACCENT, capstyle="round")
+        )

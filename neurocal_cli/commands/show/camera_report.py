@@ -1,8 +1,9 @@
-"""A calibration, its errors on points and the target it found, as text, as rows of tables and as JSON."""
+"""A calibration, its errors on points and on planes, and the target it found, as text, tables and JSON."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -26,12 +27,14 @@ from neurocal_cli.commands.show.text import (
     rounded,
     verdict_json,
     verdict_lines,
+    with_std,
 )
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.target import Target, scale_of
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.evaluation import CameraEvaluation
+    from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, Spread
 
 _LEAST_STRETCH = 1e-6  # that is told of a bent target; less is rounding
 _TIED = 1.009  # ratio of cross-validation errors that the choice of the model takes for equal
@@ -316,3 +319,63 @@ def _bias(value: float, rms: float) -> str:
     if decimals is None:
         return f"{value:+.1e}"
     return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 avoids -0
+
+
+def plane_tables(errors: PlaneErrors | None, unit: str) -> list[Table]:
+    """Rows, the heading first: a length and two points, with the shares of calibration and pixels."""
+    if errors is None:
+        return []
+    unit = printable(unit)
+    rows = [[f"at {errors.distance:g} {unit}", f"std [{unit}]", "of calibration", "of pixels"]]
+    for what, spread in (
+        (f"a length of {errors.length:.4g} {unit}", errors.of_length),
+        ("a point in the middle", errors.of_middle),
+        ("its depth", errors.of_depth),
+        ("the least certain point", errors.of_worst),
+    ):
+        if spread is None:
+            continue
+        told = spread.std, spread.by_calibration, spread.by_pixel
+        rows.append([what, *(rounded(std, std)[0] for std in told)])
+    return [rows]
+
+
+def plane_json(errors: PlaneErrors | None) -> dict[str, Any]:
+    """The same as an entry of JSON; none without errors."""
+    if errors is None:
+        return {}
+
+    def shares(spread: Spread) -> dict[str, float]:
+        return {"std": spread.std, "calibration": spread.by_calibration, "pixels": spread.by_pixel}
+
+    at = {
+        "distance": errors.distance,
+        "sigma_px": errors.sigma,
+        "length": {"length": errors.length, **shares(errors.of_length)},
+        "middle": shares(errors.of_middle),
+        **({} if errors.of_depth is None else {"depth": shares(errors.of_depth)}),
+        "worst": shares(errors.of_worst),
+    }
+    return {"at": at}
+
+
+def position_tables(positions: Mapping[str, CameraPosition], unit: str) -> list[Table]:
+    """Rows, the heading first: where the camera was in each view; no table without views."""
+    rows = [["camera in", *(f"{axis} [{printable(unit)}]" for axis in "XYZ")]]
+    for name, place in positions.items():
+        pairs = zip(place.point.tolist(), place.std.tolist(), strict=True)
+        cells = [with_std(value, std) if std > 0 else f"{value:.7g}" for value, std in pairs]
+        rows.append([printable(name), *cells])
+    return [rows] if positions else []
+
+
+def positions_json(positions: Mapping[str, CameraPosition]) -> dict[str, Any]:
+    """The same as values for JSON, with covariances."""
+    return {
+        name: {
+            "point": place.point,
+            "std": place.std,
+            "covariance": place.covariance,
+        }
+        for name, place in positions.items()
+    }

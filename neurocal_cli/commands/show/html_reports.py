@@ -17,29 +17,24 @@ from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import in_plane
-from neurocal_cli.commands.show.camera_report import parameter_rows, target_lines
-from neurocal_cli.commands.show.html_drawings import (
-    board_shape,
-    enlargement,
-    error_bars,
-    heat_map,
-    residual_map,
-    scatter,
-)
+from neurocal_cli.commands.show.camera_report import parameter_rows, plane_tables, target_lines
 from neurocal_cli.commands.show.html_page import (
     Origin,
+    board_shape,
     definitions,
+    enlargement,
+    error_bars,
     figure,
+    heat_map,
     page,
+    residual_map,
+    scatter,
     section,
     table,
     verdict_block,
 )
-from neurocal_cli.commands.show.plane_report import plane_tables
-from neurocal_cli.commands.show.rig_panels import edge_coverage, rig_in_space
-from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_rows
-from neurocal_cli.commands.show.rig_report import pose_rows
-from neurocal_cli.commands.show.stereo_report import camera_rows, pair_name, rig_rows
+from neurocal_cli.commands.show.plot_pages import edge_coverage, rig_in_space
+from neurocal_cli.commands.show.rig_report import camera_rows, pair_name, pose_rows, rig_rows, side_rows
 from neurocal_cli.commands.show.text import printable, with_std
 from neurocal_cli.commands.show.zoom_report import lens_words, network_rows
 from neurocal_cli.errors import InputError
@@ -91,7 +86,7 @@ def _stereo_page(rig: StereoRig, origin: Origin, photographs: Photographs) -> st
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(rig.verdict),
         section("The right camera relative to the left one", table(rig_rows(rig))),
-        section("Both cameras", table(camera_rows(rig))),
+        section("Both cameras", table(side_rows(rig))),
         section("Pairs", table(pairs, sortable=True)),
         section("Pairs left out", table(left_out)),
         _warnings(rig.warnings),
@@ -131,7 +126,7 @@ def _rig_page(rig: Rig, origin: Origin) -> str:
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(rig.verdict),
         section(f"The poses of the cameras, relative to {first}", "".join(map(table, pose_rows(rig)))),
-        section("The cameras", "".join(map(table, named_camera_rows(rig)))),
+        section("The cameras", "".join(map(table, camera_rows(rig)))),
         section("The rig in space", f'<div class="figures">{space}</div>' if space else ""),
         section("Pairs of cameras", table(edges, sortable=True)),
         section("Frames", table(frames, sortable=True)),

@@ -1,16 +1,23 @@
-"""The page and the pictures of any result, for Python."""
+"""The page and the pictures of any result for Python, and what a notebook shows of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from html import escape
 from typing import TYPE_CHECKING
 
 from neurocal_cli.calibration.advice import advise
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.commands.show import CAMERA_PANELS
+from neurocal_cli.commands.show.camera_report import parameter_rows
+from neurocal_cli.commands.show.html_page import table, verdict_block
+from neurocal_cli.commands.show.rig_report import pose_rows, rig_rows, side_rows
+from neurocal_cli.commands.show.text import Table
+from neurocal_cli.commands.show.zoom_report import network_rows
 from neurocal_cli.errors import InputError, UsageError, check_choice
 
 if TYPE_CHECKING:
@@ -80,7 +87,7 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
     """
     check_choice("kind", kind, _KINDS)
     if isinstance(result, Calibration) and panel == "next":
-        from neurocal_cli.commands.show.advised_views import draw_advice
+        from neurocal_cli.commands.show.advice import draw_advice
 
         return Picture(draw_advice(advise(result), result, kind))
     panels = CAMERA_PANELS if isinstance(result, (Calibration, StereoRig)) else ()
@@ -89,7 +96,7 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
             raise UsageError("this result has a single picture; leave out panel")
         check_choice("panel", panel, (*panels, "next") if isinstance(result, Calibration) else panels)
     if isinstance(result, ZoomLens):
-        from neurocal_cli.commands.show.zoom_plots import draw_lens
+        from neurocal_cli.commands.show.zoom_report import draw_lens
 
         return Picture(draw_lens(result, kind))
     from neurocal_cli.commands.show.plot_pages import draw_camera, draw_rig, draw_stereo
@@ -103,3 +110,16 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
     from neurocal_cli.commands.show.camera_panels import Subject
 
     return Picture(draw_camera(Subject.of(result), kind, panel))
+
+
+def notebook_html(result: Calibration | StereoRig | Rig | ZoomLens) -> str:
+    """The verdict and the parameters of a result."""
+    if isinstance(result, Calibration):
+        tables: tuple[Table, ...] = (parameter_rows(result),)
+    elif isinstance(result, StereoRig):
+        tables = side_rows(result), rig_rows(result)
+    else:
+        tables = (network_rows(result),) if isinstance(result, ZoomLens) else pose_rows(result)
+    verdict = judge_lens(result) if isinstance(result, ZoomLens) else result.verdict
+    head = f"<p>{escape(repr(result).splitlines()[0])}</p>"
+    return "".join([head, verdict_block(verdict), *map(table, tables)])

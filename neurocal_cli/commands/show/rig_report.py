@@ -1,31 +1,43 @@
-"""A rig of any number of cameras as text and as JSON."""
+"""A rig of two cameras or more and its errors in space, as text, tables and JSON."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.rig_evaluation import RigEvaluation
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
 from neurocal_cli.commands.show.text import (
+    UNITS,
     Table,
     align,
+    align_views,
     four_digits,
     joined,
+    labelled,
     outcome_json,
     parameters,
     printable,
+    rounded,
     verdict_json,
     verdict_lines,
     with_std,
 )
 from neurocal_cli.errors import plural
-from neurocal_cli.simulation.rigs import RigStudy
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
+    from neurocal_cli.calibration.rig.rig_evaluation import RigEvaluation
+    from neurocal_cli.calibration.rig.space_error import SpaceError
 
 _SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_EDGES = 20  # rows of a table that fit on a screen
+_MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
+_NAMED = 10  # views named in a remark
+_ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
 
 def rig_report(rig: Rig) -> str:
@@ -160,28 +172,193 @@ def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
     }
 
 
-def rig_study_table(study: RigStudy) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Titles and rows of the table of a simulated rig, and a line below it."""
-    rows = [["sigma [px]", "rms [px]", "place [mm]", "rotation [rad]", "error / std"]]
-    columns = study.sigma, study.rmse_px, study.centre, study.rotation, study.over_std
-    for noise, rmse, centre, rotation, ratio in zip(*columns, strict=True):
-        rows.append([f"{noise:g}", f"{rmse:.4g}", f"{centre:.4g}", f"{rotation:.3g}", f"{ratio:.2f}"])
-    n, frames = len(study.rig.cameras), len(study.rig.frames)
-    title = f"rms errors of {n} cameras in {plural(study.trials, 'trial')}, {frames} frames"
-    return [(title, rows)], ["error / std is 1 where the reported standard deviations are right"]
+def stereo_report(rig: StereoRig) -> str:
+    """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
+    headline = [f"rig: {plural(len(rig.pairs), 'pair')} of views"]
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        seen = f"{plural(len(camera.points), 'point')} in {plural(len(camera.views), 'view')}"
+        headline.append(f"{name} {seen}")
+    pairs = []
+    for a, b in rig.pairs:
+        views = rig.left.views[a], rig.right.views[b]
+        cells = [cell for view in views for cell in (str(view.n_points), four_digits(view.rmse_px))]
+        pairs.append((max(view.rmse_px for view in views), [pair_name(a, b), *cells]))
+    return joined(
+        [", ".join(headline)],
+        align(side_rows(rig)),
+        align(rig_rows(rig)),
+        align_views(["view", "left points", "rms [px]", "right points", "rms [px]"], pairs, "pairs"),
+        _pair_fit_lines(rig),
+        verdict_lines(rig.verdict),
+    )
 
 
-def rig_study_json(study: RigStudy) -> dict[str, Any]:
-    """The study of a simulated rig as JSON values."""
+def pair_name(left: str, right: str) -> str:
+    """The names of the views of a pair, or the one that both have."""
+    return printable(left if left == right else f"{left} / {right}")
+
+
+def side_rows(rig: StereoRig) -> Table:
+    """Both cameras' parameters side by side."""
+    rows = [["parameter", "left", "std", "right", "std"]]
+    rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
+    cells = [
+        {
+            name: (f"{value:.7g}", "fixed")
+            if name in camera.fixed
+            else rounded(value, camera.std.get(name, math.nan))
+            for name, value in parameters(camera).items()
+        }
+        for camera in (rig.left, rig.right)
+    ]
+    for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
+        estimates = [cell for own in cells for cell in own.get(name, ("", ""))]
+        rows.append([labelled(name, UNITS.get(name, "")), *estimates])
+    return rows
+
+
+def rig_rows(rig: StereoRig) -> Table:
+    """Rows of the pose of the right camera and the baseline, with their standard deviations."""
+    rows = [["X_right = R X_left + t", "value", "std"]]
+    length = printable(rig.unit)
+    for name, value in _pose_values(rig).items():
+        unit = "rad" if name.startswith("R") else length
+        rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
+    return [*rows, [f"baseline [{length}]", *rounded(rig.baseline, rig.std["baseline"])]]
+
+
+def _pose_values(rig: StereoRig) -> dict[str, float]:
+    return dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
+
+
+def _pair_fit_lines(rig: StereoRig) -> list[str]:
+    """How the cameras and the rig were fitted, and what the fit found."""
+    lines = []
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        record = camera.network
+        if record is not None:
+            lines.append(
+                f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
+                f"at least {record.agreed} agreed in each view; rms {four_digits(camera.rmse_px)} px"
+            )
+    lines.append(
+        f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} px, after "
+        f"{plural(rig.iterations, 'iteration')}"
+    )
+    if rig.delay is not None:
+        unit = "s" if rig.timed else "of the time between frames"
+        lines.append(f"right images later than the left ones: {with_std(*rig.delay)} {unit}")
+    lines += target_lines(rig.left.target or rig.right.target, rig.unit)
+    measures = {} if rig.verdict is None else rig.verdict.measures
+    growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
+    if growth > _MUCH_WORSE:
+        lines.append(
+            f"with the poses of each camera alone the rms is {four_digits(alone)} px; with one rig for all "
+            f"pairs it is {growth:.2g} times as much"
+        )
+    return [*lines, rig.stop_reason]
+
+
+def stereo_json(rig: StereoRig) -> dict[str, Any]:
+    """The summary of a rig as JSON values; None for numbers that do not exist."""
     return {
-        "trials": study.trials,
-        "frames": len(study.rig.frames),
-        "sigma_px": study.sigma,
-        "rmse_px": study.rmse_px,
-        "place_mm": study.centre,
-        "rotation_rad": study.rotation,
-        "error_over_std": study.over_std,
-        "poses": {
-            name: {"R": pose.R.tolist(), "t": pose.t.tolist()} for name, pose in study.rig.relative.items()
+        "left": calibration_json(rig.left),
+        "right": calibration_json(rig.right),
+        "unit": rig.unit,
+        "R": rig.R,
+        "t": rig.t,
+        "baseline": rig.baseline,
+        "parameters": {
+            name: {"value": value, "std": rig.std[name]} for name, value in _pose_values(rig).items()
         },
+        "baseline_std": rig.std["baseline"],
+        "rmse_px": rig.rmse_px,
+        "max_px": rig.max_px,
+        "pairs": rig.pairs,
+        "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
+        "delay": None if rig.delay is None else {"value": rig.delay[0], "std": rig.delay[1]},
+        **outcome_json(rig),
+    }
+
+
+def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
+    """Remarks that name the views of one camera alone."""
+    return [
+        f"only the {side} camera saw {', '.join(map(printable, names[:_NAMED]))}"
+        + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
+        for side, names in zip(("left", "right"), alone, strict=True)
+        if names
+    ]
+
+
+def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
+    """Rows of the tables of all points, of the depths and of the views, each with its heading."""
+    unit = evaluation.unit
+    ways, heads = [evaluation.by_view], ["poses of each view"]
+    if evaluation.rig is not None:
+        if math.isclose(evaluation.rig.rmse, evaluation.by_view.rmse, rel_tol=1e-4):
+            ways, heads = [], []  # both are equal for a rig or a single view
+        ways, heads = [*ways, evaluation.rig], [*heads, "one rig"]
+    overall = [[f"[{unit}]", *heads]]
+    for label, name in (
+        ("X rms", "rmse_x"),
+        ("Y rms", "rmse_y"),
+        ("Z (depth) rms", "rmse_z"),
+        ("rms", "rmse"),
+        ("maximum", "max"),
+        ("rms / depth", "relative"),
+        ("NSCE", "nsce"),
+        ("epipolar rms [px]", "epipolar_px"),
+    ):
+        values = [getattr(way, name) for way in ways]
+        overall.append([label, *(_share(v) if name == "relative" else four_digits(v) for v in values)])
+    overall.append(["points", *(str(way.n_points) for way in ways)])
+    for side, model in zip(("left", "right"), evaluation.models, strict=True):
+        overall.append([f"{side} distortion model", model, *([""] * (len(ways) - 1))])
+    depths = [[f"depth [{unit}]", "points", f"rms [{unit}]", "rms / depth"]]
+    for part in ways[-1].depths:
+        span = f"{four_digits(part.nearest)} - {four_digits(part.farthest)}"
+        depths.append([span, str(part.n_points), four_digits(part.rmse), _share(part.relative)])
+    views = [["view", "points", *(f"{head} [{unit}]" for head in heads)]]
+    right_names = dict(evaluation.pairs)
+    for name, (count, _) in ways[0].views.items():
+        errors = [four_digits(way.views.get(name, (0, math.nan))[1]) for way in ways]
+        views.append([pair_name(name, right_names[name]), str(count), *errors])
+    return (overall, depths, views) if len(views) > 2 else (overall, depths)
+
+
+def _share(value: float) -> str:
+    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
+
+
+def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
+    """An evaluation as JSON values; None for numbers that do not exist."""
+    return {
+        **_error_json(evaluation.by_view),
+        "unit": evaluation.unit,
+        "baseline": evaluation.baseline,
+        "pairs": evaluation.pairs,
+        "fitted_views": evaluation.fitted,
+        "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
+        "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
+        **verdict_json(evaluation.verdict),
+    }
+
+
+def _error_json(error: SpaceError) -> dict[str, Any]:
+    return {
+        "n_points": error.n_points,
+        "n_behind": error.n_behind,
+        **{name: getattr(error, name) for name in _ERRORS},
+        "views": {name: rmse for name, (_, rmse) in error.views.items()},
+        "depths": [
+            {
+                "from": part.nearest,
+                "to": part.farthest,
+                "n_points": part.n_points,
+                "rmse": part.rmse,
+                "relative": part.relative,
+            }
+            for part in error.depths
+        ],
     }

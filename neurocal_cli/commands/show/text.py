@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.screen import table_width
-from neurocal_cli.commands.streams import verbose
+from neurocal_cli.commands.streams import table_width, verbose
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict

@@ -1,15 +1,20 @@
-"""The board of ``neurocal detect``: described by the user, or found in the images, and compared with them."""
+"""The board of a command: its options, and the board that images show, found or compared with them."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from math import gcd
 from typing import TYPE_CHECKING
 
-from neurocal_cli.commands.options import BoardOptions
+import click
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.commands import options
+from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import ProgressBar, complain, note, say, warn
-from neurocal_cli.errors import NeurocalError
+from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,10 +32,132 @@ _COMPARED = 3  # images, with a described board with markers
 _FEW = 3  # images; fewer may by chance show the same part of the board
 
 
-def described_board(options: BoardOptions) -> Board | None:
+@frozen_dataclass
+class BoardOptions:
+    """The values of the options of a board, whose file is not read yet."""
+
+    file: str | None
+    cols: int | None
+    rows: int | None
+    square: float | None
+    unit: str | None
+
+    def read(self) -> Board | None:
+        """The board; None if no option describes one, a UsageError if they contradict each other."""
+        from neurocal_cli.observations.board import Board
+
+        self.check_unit()
+        cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
+        if self.file is not None:
+            from neurocal_cli.files.board_kinds import short_board
+
+            if (cols, rows, square) == (None,) * 3:
+                short = short_board(self.file, "mm" if unit is None else unit)
+                if short is not None:
+                    return short
+            if (cols, rows, square, unit) != (None,) * 4:
+                raise UsageError(
+                    "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+                )
+            from neurocal_cli.files.board_yaml import read_board
+
+            return read_board(self.file)
+        if (cols, rows, square, unit) == (None,) * 4:
+            return None
+        if cols is None or rows is None or square is None:
+            given = {"--cols": cols, "--rows": rows, "--square": square}
+            missing = " and ".join(name for name, value in given.items() if value is None)
+            raise UsageError(f"{missing} missing; give --cols, --rows and --square, or --board BOARD.yaml")
+        return Board.single(cols, rows, square, "mm" if unit is None else unit)
+
+    def read_or_unknown(self) -> Board | None:
+        """The board, for a command that finds its size itself: None without a size; the square may lack."""
+        if self.file is not None:
+            return self.read()
+        counts, (square, unit) = self.counts, self.side
+        if not counts:
+            return None
+        from neurocal_cli.observations.board import Board
+
+        return Board.single(*counts, square, unit)
+
+    @property
+    def counts(self) -> tuple[int, int] | tuple[()]:
+        """Columns and rows; none if neither is given."""
+        if self.cols is not None and self.rows is not None:
+            return self.cols, self.rows
+        if self.cols is None and self.rows is None:
+            return ()
+        missing = "--rows" if self.rows is None else "--cols"
+        raise UsageError(f"{missing} is missing; give both --cols and --rows, or neither")
+
+    @property
+    def side(self) -> tuple[float, str]:
+        """Side of a square and its unit; if the side is unknown, it is the unit."""
+        self.check_unit()
+        if self.square is not None:
+            return self.square, "mm" if self.unit is None else self.unit
+        if self.unit is not None:
+            raise UsageError("--unit is the unit of --square, which is missing; give both")
+        return 1.0, "squares"
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the board is described by a file, not in short."""
+        from neurocal_cli.files.board_kinds import SHORT_FORMS
+
+        return self.file is not None and self.file.partition(":")[0] not in SHORT_FORMS
+
+    def check_unit(self) -> None:
+        """Refuse a unit that cannot be stored in a file, with a UsageError."""
+        unit = self.unit
+        if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
+            raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")
+
+
+_BOARD_FILE = (
+    "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
+    "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
+    "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], circles:COLSxROWS:DISTANCE[:DIAMETER], "
+    "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
+    "and ROWS count squares, tags or circles; of a chessboard, inner vertices."
+)
+
+
+def board_of_corners(command: F) -> F:
+    """Add ``--board``, for points of other programs without their places, a command's keyword ``board``."""
+    what = f"Board of corners whose file does not have their places, such as mrcal's. {_BOARD_FILE}"
+    return options.path("--board", "BOARD.yaml", what)(command)
+
+
+def named_board(name: str | None) -> Board | None:
+    """The board of ``--board``, a file or a short form; None without."""
+    return BoardOptions(name, None, None, None, None).read() if name else None
+
+
+def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
+    """Add the options of `BoardOptions`, a command's keyword ``board``."""
+    size = partial(options.count, without="none", least=2, most=1000)
+    added = (
+        options.path("--board", "BOARD.yaml", _BOARD_FILE, to="file"),
+        size("--cols", "C", "Number of inner vertices in a row of the board."),
+        size("--rows", "R", "Number of rows of inner vertices."),
+        options.number(
+            "--square",
+            "S",
+            "Side length of a square, or of a tag, or the distance of circles.",
+            without="none",
+            positive=True,
+        ),
+        click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
+    )
+    return options.collected(BoardOptions, added, "board")
+
+
+def described_board(given: BoardOptions) -> Board | None:
     """The described board in its measured size; None if its size is to be found."""
-    board = options.read_or_unknown()
-    if board is not None and options.file is None and options.square is None:
+    board = given.read_or_unknown()
+    if board is not None and given.file is None and given.square is None:
         note(_UNKNOWN.format("side of a square"))
     if board is None or not board.distances:
         return board
@@ -43,7 +170,7 @@ def described_board(options: BoardOptions) -> Board | None:
     return board.as_measured()
 
 
-def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) -> Board:
+def board_in_images(paths: Sequence[str], given: BoardOptions, enough: int) -> Board:
     """Find the board in image files, and say what it is; see `find_board`.
 
     Unless an image shows all ends of the board, it is a NoBoardError to have less than `enough` images.
@@ -60,7 +187,7 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
         raise NoBoardError(
             "it is not certain where the board ends; more images of the whole board are needed"
         )
-    (side, unit), length = options.side, unit_length(plane)
+    (side, unit), length = given.side, unit_length(plane)
     say(f"found {found_words(plane)}")
     warn(*found.doubts)
     if not found.sure:
@@ -70,7 +197,7 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
         elif not isinstance(plane, CirclePlane):
             more = f"than {plane.cols} x {plane.rows} inner vertices, give their numbers by --cols and --rows"
         warn(f"no image shows that the board ends {sides}; if it has more {more}")
-    if options.square is None:
+    if given.square is None:
         note(_UNKNOWN.format(length))
         unit = (
             "squares"
