@@ -77,6 +77,7 @@ def board(
       neurocal board --board charuco:8x6:28:21 -o charuco.pdf
       neurocal board --board charuco:6x5:30:22 --boards 3 -o rig.pdf
       neurocal board --board aprilgrid:6x6:20:0.3 -o tags.svg
+      neurocal board --board arucogrid:5x7:20:0.25:DICT_6X6_50 -o aruco.svg
       neurocal board --board asymmetric_circles:4x11:20 --paper A3 -o circles.pdf
     """  # noqa: D301 - as in the group
     ending = os.path.splitext(output)[1].lower()

@@ -118,7 +118,8 @@ class BoardOptions:
 _BOARD_FILE = (
     "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
     "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
-    "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], circles:COLSxROWS:DISTANCE[:DIAMETER], "
+    "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY, "
+    "circles:COLSxROWS:DISTANCE[:DIAMETER], "
     "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
     "and ROWS count squares, tags or circles; of a chessboard, inner vertices."
 )

@@ -20,6 +20,7 @@ KIND_KEYS = {
     "chessboard": ("squares", "square", "cols", "rows"),
     "charuco": ("squares", "square", "marker", "dictionary", "legacy", "first_id", "inverted"),
     "aprilgrid": ("tags", "tag", "spacing", "family", "first_id", "border", "inverted"),
+    "arucogrid": ("markers", "marker", "spacing", "dictionary", "first_id", "border", "inverted"),
     "circles": ("circles", "distance", "diameter"),
     "asymmetric_circles": ("circles", "distance", "diameter"),
 }
@@ -27,6 +28,7 @@ SHORT_FORMS = {
     "chessboard": "chessboard:COLSxROWS:SQUARE (inner vertices)",
     "charuco": "charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY] (squares)",
     "aprilgrid": "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY] (tags)",
+    "arucogrid": "arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY (markers)",
     "circles": "circles:COLSxROWS:DISTANCE[:DIAMETER]",
     "asymmetric_circles": "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]",
 }
@@ -36,7 +38,7 @@ _KALIBR = ("target_type", "tagCols", "tagRows", "tagSize", "tagSpacing", "target
 def kind_of(plane: Plane) -> str:
     """Name of a plane's kind in board files."""
     if isinstance(plane, TagPlane):
-        return "aprilgrid"
+        return "arucogrid" if plane.downwards else "aprilgrid"
     if isinstance(plane, CirclePlane):
         return "asymmetric_circles" if plane.asymmetric else "circles"
     return "chessboard" if plane.markers is None else "charuco"
@@ -51,15 +53,18 @@ def read_plane(field: Field, kind: str, name: str, place: dict[str, Any]) -> Pla
             field[key].fail("two whole numbers, [columns, rows]")
         return counts[0], counts[1]
 
-    if kind == "aprilgrid":
-        cols, rows = pair("tags")
-        tag, family = field["tag"].number(), field.get("family", "tag36h11").text()
+    if kind in ("aprilgrid", "arucogrid"):
+        downwards = kind == "arucogrid"
+        cols, rows = pair("markers" if downwards else "tags")
+        tag = field["marker" if downwards else "tag"].number()
+        family = (field["dictionary"] if downwards else field.get("family", "tag36h11")).text()
         first, inverted = field.get("first_id", 0).integer(0), field.get("inverted", False).boolean()
         markers = Markers(tag, family, None, first, inverted)
-        spacing, border = field["spacing"].number(), field.get("border", 2).integer(1)
+        spacing, border = field["spacing"].number(), field.get("border", 1 if downwards else 2).integer(1)
         return TagPlane(
-            name, 2 * cols, 2 * rows, tag, markers=markers, spacing=spacing, border=border, **place
-        )
+            name, 2 * cols, 2 * rows, tag, markers=markers, spacing=spacing, border=border,
+            downwards=downwards, **place,
+        )  # fmt: skip
     if kind in ("circles", "asymmetric_circles"):
         cols, rows = pair("circles")
         distance, diameter = field["distance"].number(), field.get("diameter", 0.0).number()
@@ -89,6 +94,17 @@ def kind_entries(plane: Plane) -> dict[str, str]:
     """Keys of a plane's kind, for a file; nothing for a chessboard, whose keys are the file's own."""
     markers = plane.markers
     inverted = {"inverted": "true"} if markers is not None and markers.inverted else {}
+    if isinstance(plane, TagPlane) and markers is not None and plane.downwards:
+        return {
+            "kind": "arucogrid",
+            "markers": f"[{plane.tags[0]}, {plane.tags[1]}]",
+            "marker": number(plane.square),
+            "spacing": number(plane.spacing),
+            "dictionary": text(markers.dictionary),
+            "first_id": str(markers.first_id),
+            **({} if plane.border == 1 else {"border": str(plane.border)}),
+            **inverted,
+        }
     if isinstance(plane, TagPlane) and markers is not None:
         family = markers.dictionary.removeprefix("DICT_APRILTAG_")
         known = f"tag{family}" if family != markers.dictionary else markers.dictionary
@@ -138,8 +154,10 @@ def short_board(form: str, unit: str = "mm") -> Board | None:
     if counts is None:
         raise wrong
     cols, rows = int(counts[1]), int(counts[2])
-    words = {"charuco": 2, "aprilgrid": 2}.get(kind)
+    words = {"charuco": 2, "aprilgrid": 2, "arucogrid": 2}.get(kind)
     code = parts.pop() if words is not None and len(parts) == words + 1 else ""
+    if kind == "arucogrid" and not code:
+        raise wrong
     try:
         lengths = [float(part) for part in parts]
     except ValueError:
@@ -155,6 +173,9 @@ def short_board(form: str, unit: str = "mm") -> Board | None:
             )
         if kind == "aprilgrid":
             return Board((TagPlane.of((cols, rows), lengths[0], lengths[1], code or "tag36h11"),), unit)
+        if kind == "arucogrid":
+            side, spacing = lengths
+            return Board((TagPlane.of((cols, rows), side, spacing, code, border=1, downwards=True),), unit)
         diameter = lengths[1] if len(lengths) > 1 else 0.0
         asymmetric = kind != "circles"
         plane = CirclePlane("", cols, rows, lengths[0], diameter=diameter, asymmetric=asymmetric)

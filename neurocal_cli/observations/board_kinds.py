@@ -19,16 +19,20 @@ _EDGES = {("h:", 0, 0): "e0", ("v:", 1, 0): "e1", ("h:", 0, 1): "e2", ("v:", 0, 
 
 @frozen_dataclass
 class TagPlane(Plane):
-    """A grid of AprilTags as Kalibr prints it: small dark squares at the corners of the tags.
+    """A grid of tags: Kalibr's AprilGrid, or OpenCV's GridBoard of ArUco markers.
 
     It is a chessboard with lines at unequal distances: `cols` and `rows` count the tags' corners, two for
-    each tag, and `square` is the side of a tag. As Kalibr's, the first tag is at the lower left and y points
-    upwards. Corners of a tag are numbered anticlockwise from the lower left, its edges from the lower one:
-    ``tag:0`` to ``tag:3`` and ``tag:e0`` to ``tag:e3``.
+    each tag, and `square` is the side of a tag. Kalibr prints small dark squares at the corners of the tags;
+    its first tag is at the lower left and y points upwards. Corners of a tag are numbered anticlockwise from
+    the lower left, its edges from the lower one: ``tag:0`` to ``tag:3`` and ``tag:e0`` to ``tag:e3``.
+
+    The markers of OpenCV's GridBoard stand alone. The first is at the upper left and y points `downwards`;
+    corners and edges are numbered clockwise from the upper left corner and the upper edge.
     """
 
     spacing: float = 0.3  # distance between tags over their side
     border: int = 2  # cells around the code; 1 in other programs than Kalibr
+    downwards: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,12 +44,14 @@ class TagPlane(Plane):
     @classmethod
     def of(
         cls, tags: tuple[int, int], tag: float, spacing: float, family: str = "tag36h11", first_id: int = 0,
-        name: str = "", border: int = 2,
+        name: str = "", border: int = 2, downwards: bool = False,
     ) -> TagPlane:  # fmt: skip
-        """Plane of (columns, rows) of tags of a side, with codes of a family."""
+        """Plane of (columns, rows) of tags of a side, with codes of a family or dictionary."""
         cols, rows = (2 * count for count in tags)
         markers = Markers(tag, family, None, first_id)
-        return cls(name, cols, rows, tag, markers=markers, spacing=spacing, border=border)
+        return cls(
+            name, cols, rows, tag, markers=markers, spacing=spacing, border=border, downwards=downwards
+        )
 
     @property
     def tags(self) -> tuple[int, int]:
@@ -127,7 +133,9 @@ def circle_places(plane: CirclePlane) -> tuple[Array, float]:
 def described(plane: Plane, unit: str) -> str:
     """A plane in words: what one counts on it, and its lengths."""
     if isinstance(plane, TagPlane):
-        return f"{plane.tags[0]} x {plane.tags[1]} tags of {plane.square:g} {unit}, spacing {plane.spacing:g}"
+        kind = "ArUco markers" if plane.downwards else "tags"
+        size = f"{plane.tags[0]} x {plane.tags[1]} {kind} of {plane.square:g} {unit}"
+        return f"{size}, spacing {plane.spacing:g}"
     if isinstance(plane, CirclePlane):
         kind = "asymmetric circles" if plane.asymmetric else "circles"
         return f"{plane.cols} x {plane.rows} {kind}, distance {plane.square:g} {unit}"

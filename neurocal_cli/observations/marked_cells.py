@@ -58,8 +58,8 @@ def marked_cells(plane: Plane, how: Print) -> Cells:
     if isinstance(plane, TagPlane):
         cols, rows = plane.tags
         cell = np.array([(2 * i, 2 * j) for j, i in product(range(rows), range(cols))])
-        # y points upwards.
-        outline = np.roll(np.array([[0, 1], [1, 1], [1, 0], [0, 0]], dtype=float), how.turn, axis=0)
+        upright = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
+        outline = np.roll(upright if plane.downwards else upright[::-1], how.turn, axis=0)
     else:
         light = 0 if how.legacy else 1
         squares = product(range(plane.rows + 1), range(plane.cols + 1))
@@ -87,12 +87,12 @@ def patterns(plane: Plane, cells: Cells, dictionary: str, how: Print) -> NDArray
 
     Raises InputError if the dictionary has too few codes.
     """
-    tags = isinstance(plane, TagPlane)
     border = plane.border if isinstance(plane, TagPlane) else 1
     every = np.stack([code(dictionary, number, border) for number in cells.number.tolist()])
-    if not tags:
+    if not isinstance(plane, TagPlane):
         return every
-    return np.stack([np.rot90(one, how.turn)[::-1] for one in every])  # y points upwards
+    turned = np.rot90(every, how.turn, axes=(1, 2))
+    return turned if plane.downwards else turned[:, ::-1]
 
 
 def printed_rectangles(plane: Plane) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -113,7 +113,10 @@ def printed_rectangles(plane: Plane) -> tuple[Array, Array, NDArray[np.bool_]]:
     fine = [np.unique(np.round((np.arange(-1, n)[:, None] + [0.0, *within, 1.0]).ravel(), 9)) for n in counts]
     middles = [0.5 * (one[1:] + one[:-1]) for one in fine]
     c, r = (np.floor(one).astype(int) for one in middles)
-    grid = (c + r[:, None] + int(how.legacy)) % 2 == 0
+    if isinstance(plane, TagPlane) and plane.downwards:  # its markers stand alone
+        grid = np.zeros((len(r), len(c)), dtype=np.bool_)
+    else:
+        grid = (c + r[:, None] + int(how.legacy)) % 2 == 0
     place = {tuple(cell): k for k, cell in enumerate(cells.cell.tolist())}
     count = len(within) - 1
     for (x, y), k in place.items():

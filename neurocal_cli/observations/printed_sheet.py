@@ -86,10 +86,10 @@ class Laid:
         if isinstance(self.plane, CirclePlane):
             centres, radius = circle_places(self.plane)
             return centres.min(axis=0) - radius, centres.max(axis=0) + radius
-        if isinstance(self.plane, TagPlane):
+        if isinstance(self.plane, TagPlane) and not self.plane.downwards:  # with the squares at its corners
             ends = np.array([[-1.0, -1.0], [self.plane.cols, self.plane.rows]])
             return tuple(self.plane.spread(ends))
-        last = np.array([self.plane.cols - 1, self.plane.rows - 1], dtype=float)
+        last = self.plane.spread(np.array([self.plane.cols - 1, self.plane.rows - 1], dtype=float))
         return -self.reach[:, 0], last + self.reach[:, 1]
 
     @property
@@ -295,8 +295,8 @@ def _first_map(planes: tuple[Plane, ...]) -> _Map:
     """The first plane's x_axis is to the right, as one sees it from the printed side."""
     plane = planes[0]
     down = np.array(plane.y_axis)
-    if isinstance(plane, TagPlane):
-        down = -down  # its y points upwards
+    if isinstance(plane, TagPlane) and not plane.downwards:
+        down = -down
     if len(planes) > 1:
         others = np.mean([_middle(other) for other in planes[1:]], axis=0)
         if (others - _middle(plane)) @ plane.normal > 0:  # x, y and the way to the eye are right-handed

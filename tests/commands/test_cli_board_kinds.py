@@ -11,7 +11,7 @@ import pytest
 from support.command_line import run
 from support.marked import marked_scene
 
-from neurocal_cli import read_board
+from neurocal_cli import read_board, read_points
 from neurocal_cli.commands.boards import another_size
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.files.board_kinds import short_board
@@ -44,6 +44,24 @@ def test_a_printed_board_is_found_by_its_file(tmp_path: Path, form: str, points:
     upwards = -1 if form.startswith("april") else 1
     np.testing.assert_allclose(linear, DPI / 25.4 * np.diag([1, upwards]), atol=2e-3)
     assert np.abs(world @ linear - pixels).max() < 0.08
+
+
+def test_a_printed_grid_of_aruco_markers_is_measured_at_its_edges(tmp_path: Path) -> None:
+    picture, points = tmp_path / "board.png", tmp_path / "p.csv"
+    form = "arucogrid:4x3:30:0.25:DICT_4X4_50"
+    assert run("board", "--board", form, "--dpi", DPI, "-o", picture).exit_code == 0
+    image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    cv2.imwrite(str(picture), cv2.GaussianBlur(image, (0, 0), 0.7))
+    assert run("detect", picture, "--board", tmp_path / "board.yaml", "-o", points).exit_code == 0
+    found = read_points(points)
+    assert len(found) == 4 * 12
+    assert found.point is not None
+    assert set(found.point.tolist()) == {f"{n}:e{k}" for n in range(12) for k in range(4)}
+    world, pixels = (one - one.mean(axis=0) for one in (found.world[:, :2], found.pixels))
+    across = found.across
+    assert across is not None
+    assert np.abs(((world * DPI / 25.4 - pixels) * across).sum(axis=1)).max() < 0.08
 
 
 def test_a_printed_board_is_found_without_a_description(tmp_path: Path) -> None:

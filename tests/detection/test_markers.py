@@ -257,6 +257,22 @@ def test_tags_without_squares_have_the_mid_points_of_their_edges(
         detect_points(picture.image, Board((replace(plane, border=1),)))
 
 
+@pytest.mark.parametrize("condition", slow_but(({},), ({}, {"psf": 1.6}, {"tilt": 60.0}, {"noise": 8.0})))
+def test_markers_that_stand_alone_have_the_mid_points_of_their_edges(condition: dict[str, float]) -> None:
+    scene = marked_scene(plane_of("arucogrid:3x2:40:0.25:DICT_4X4_50"), 6, square=56, **condition)
+    picture = taken(scene, 6)
+    found = detect_points(picture.image, scene.board)
+    assert not found.notes
+    places, visible = truth_of(picture)
+    assert set(found.ids) == {name for name in visible if ":e" in name}
+    across = found.across
+    assert across is not None
+    error = ((found.pixels - np.array([places[name] for name in found.ids])) * across).sum(axis=1)
+    squared = error**2 / variance_across(found.covariance, across)
+    assert np.abs(error).max() < (0.05 if condition else 0.015)
+    assert 0.5 < squared.mean() < 1.6
+
+
 def test_markers_without_a_chessboard_around_them_are_named() -> None:
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     image = cv2.aruco.GridBoard((6, 4), 30.0, 8.0, family).generateImage((1000, 750), marginSize=60)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
+from neurocal_cli.observations.marked_cells import printed_rectangles
 from neurocal_cli.observations.markers import Markers, code, dictionary_name
 
 CHARUCO = """kind: charuco
@@ -20,6 +22,9 @@ dictionary: DICT_4X4_1000
 legacy: auto
 first_id: 4
 """
+ARUCOGRID = (
+    "kind: arucogrid\nmarkers: [5, 7]\nmarker: 40\nspacing: 0.25\ndictionary: DICT_6X6_250\nborder: 2\n"
+)
 APRILGRID = "kind: aprilgrid\nunit: m\ntags: [6, 5]\ntag: 0.088\nspacing: 0.3\nfamily: tag36h11\n"
 
 
@@ -45,6 +50,26 @@ def test_a_grid_of_tags_counts_from_the_lower_left_as_kalibr_does() -> None:
     np.testing.assert_allclose(middles["7:e3"], [pitch, pitch + 0.044, 0])
 
 
+@pytest.mark.skipif(not hasattr(cv2, "aruco"), reason="this OpenCV has no markers")
+def test_a_grid_of_aruco_markers_is_opencv_s() -> None:
+    (plane,) = parse_board(ARUCOGRID.replace("border: 2\n", "")).planes
+    assert isinstance(plane, TagPlane)
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
+    opencv = cv2.aruco.GridBoard((5, 7), 40.0, 10.0, family)
+    places = dict(zip(plane.vertex_ids(), plane.vertices().reshape(-1, 3), strict=True))
+    for number, corners in zip(opencv.getIds().ravel().tolist(), opencv.getObjPoints(), strict=True):
+        np.testing.assert_allclose([places[f"{number}:{k}"] for k in range(4)], corners, atol=1e-5)
+    middles = dict(zip(*plane.midpoints(), strict=True))
+    for k in range(4):
+        expected = (places[f"6:{k}"] + places[f"6:{(k + 1) % 4}"]) / 2
+        np.testing.assert_allclose(middles[f"6:e{k}"], expected)
+    x, y, dark = printed_rectangles(plane)
+    picture = opencv.generateImage((5 * 40 + 4 * 10, 7 * 40 + 6 * 10), None, 0, 1)
+    v, u = np.indices(picture.shape) + 0.5
+    mine = dark[np.searchsorted(y, v / 40.0), np.searchsorted(x, u / 40.0)]
+    assert (mine == (picture < 128)).mean() > 0.999
+
+
 def test_asymmetric_circles_lie_as_opencv_says() -> None:
     (plane,) = parse_board("kind: asymmetric_circles\ncircles: [4, 11]\ndistance: 20\n").planes
     assert isinstance(plane, CirclePlane)
@@ -57,6 +82,7 @@ def test_asymmetric_circles_lie_as_opencv_says() -> None:
     "text",
     [
         CHARUCO,
+        ARUCOGRID,
         CHARUCO.replace("auto", "true").replace("dictionary: DICT_4X4_1000\n", ""),
         APRILGRID + "first_id: 30\nborder: 1\n",
         "kind: circles\ncircles: [7, 6]\ndistance: 30\ndiameter: 18.5\n",
@@ -81,6 +107,10 @@ def test_a_board_reads_back(text: str) -> None:
         ("charuco:8x6:30:22:5x5_100", Plane("", 7, 5, 30.0, markers=Markers(22.0, "DICT_5X5_100"))),
         ("aprilgrid:6x6:0.088:0.3", TagPlane.of((6, 6), 0.088, 0.3)),
         ("aprilgrid:3x2:40:0.2:t25h9", TagPlane.of((3, 2), 40.0, 0.2, "tag25h9")),
+        (
+            "arucogrid:5x7:40:0.25:6x6_250",
+            TagPlane.of((5, 7), 40.0, 0.25, "DICT_6X6_250", border=1, downwards=True),
+        ),
         ("circles:7x6:20", CirclePlane("", 7, 6, 20.0)),
         ("asymmetric_circles:4x11:20:15", CirclePlane("", 4, 11, 20.0, diameter=15.0, asymmetric=True)),
     ],
@@ -101,6 +131,7 @@ def test_other_texts_are_no_short_forms(form: str) -> None:
         ("charuco:8x8:25.4:30", "marker must be at most the square's side 25.4"),
         ("charuco:8x8:30:20:DICT_9X9", "the dictionary 'DICT_9X9' is not known"),
         ("aprilgrid:6:40:0.3", "give aprilgrid:"),
+        ("arucogrid:5x7:40:0.25", "give arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY"),
         ("circles:7x6:twenty", "give circles:"),
         ("circles:7x6:20:30", "diameter must be below the distance"),
         ("aprilgrid:6x6:40:-1", "spacing must be a positive ratio"),

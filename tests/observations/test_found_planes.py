@@ -31,6 +31,7 @@ def bent(board: Board) -> Target:
         "chessboard:5x4:20",
         "charuco:5x6:20:15",
         "aprilgrid:3x2:40:0.3",
+        "arucogrid:3x2:40:0.3:DICT_4X4_50",
         "circles:4x3:20",
         "asymmetric_circles:3x5:20",
     ],

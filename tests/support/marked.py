@@ -57,7 +57,7 @@ def marked_scene(
     depth = focal * plane.square / square
     for _ in range(200):
         R = _rotation(rng, tilt)
-        if isinstance(plane, TagPlane):
+        if isinstance(plane, TagPlane) and not plane.downwards:
             R = R @ np.diag([1.0, -1.0, -1.0])  # y upwards
         place = np.array([shift[0] / focal, shift[1] / focal, 1.0]) * depth
         scene = replace(scene, pose=Pose(R, place - R @ np.array([*middle, 0.0])))

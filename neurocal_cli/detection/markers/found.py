@@ -123,11 +123,6 @@ def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundPlane:
 
 def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> FoundPlane:
     dictionary, border, tags, inverted = key
-    if tags and numbering.as_text:
-        raise NoBoardError(
-            f"the images show {numbering.cols} columns of markers of {dictionary} that stand alone, as on "
-            "OpenCV's GridBoard; use a ChArUco board or an AprilGrid, whose vertices can be measured"
-        )
     parts = joined(numbering.parts)
     above, begins = _beyond(parts, seen, last=False)
     below, stops = _beyond(parts, seen, last=True)
@@ -140,6 +135,13 @@ def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> Foun
     parts = tuple(sorted(parts, key=_shown, reverse=True))[:_MEASURED]
     step = float(np.median([part.lie.step for part in parts]))
     plane = _plane(possible[0], dictionary, border, step)
+    if tags and numbering.as_text and plane.markers is not None:
+        cols, rows, named = possible[0].cols, possible[0].rows, plane.markers.dictionary
+        raise NoBoardError(
+            f"the images show {cols} x {rows} markers that stand alone, as on OpenCV's GridBoard, and do not "
+            f"tell their distance; give --board arucogrid:{cols}x{rows}:MARKER:SPACING:{named} with the "
+            f"spacing, the gap between two markers over their side, which is about {step - 1:.2f}"
+        )
     plane = with_proportions(plane, [(seen[part.source].image, part.lie.marks) for part in parts])
     if inverted and plane.markers is not None:
         plane = replace(plane, markers=replace(plane.markers, inverted=True))

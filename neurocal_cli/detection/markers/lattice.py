@@ -155,7 +155,8 @@ def corners_of_tags(plane: TagPlane, placed: Placed) -> tuple[Grid, tuple[int, i
     c, r = np.moveaxis(np.rint(placed.cells.corners[placed.at]).astype(np.int64), 2, 0)
     found[r, c] = placed.marks.corners
     low, high = (c.min(), r.min()), (c.max() + 1, r.max() + 1)
-    part = found[low[1] : high[1], low[0] : high[0]][::-1]
+    part = found[low[1] : high[1], low[0] : high[0]]
+    part = part if plane.downwards else part[::-1]
     return Grid(np.ascontiguousarray(part), 0, paired=True), (int(low[0]), int(low[1]))
 
 

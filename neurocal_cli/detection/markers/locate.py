@@ -66,6 +66,8 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
 
 def _vertices(plane: Plane, placed: Placed, light: Image) -> tuple[Grid, tuple[int, int]] | None:
     """The vertices around the markers of a plane, or the corners of tags without squares at these."""
+    if isinstance(plane, TagPlane) and plane.downwards:
+        return corners_of_tags(plane, placed)
     found = find_vertices(plane, placed, light)
     few = found is None or found[0].seen.sum() < _WITH_SQUARES * 4 * len(placed.at)
     return corners_of_tags(plane, placed) if isinstance(plane, TagPlane) and few else found
@@ -107,16 +109,16 @@ def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[
     if not isinstance(plane, TagPlane):
         ink = Ink(cell, within, np.where(dark, -1.0, 1.0), np.ones(len(cell)))
         return Located(grid, plane, Placement(index, ((1, 0), (0, 1)), first), ink)
-    # The plane's y points upwards, the grid's rows downwards.
-    cell = np.stack([cell[:, 0], rows - 2 - cell[:, 1]], axis=-1)
-    ink = Ink(cell, within, np.where(dark[:, ::-1], -1.0, 1.0), -np.ones(len(cell)))
-    counts = [first[0] + np.arange(-1.0, cols + 1), first[1] + rows - 1 - np.arange(-1.0, rows + 1)]
-    x, y = (
-        plane.spread(np.stack([one if axis == k else 0 * one for k in (0, 1)], axis=-1))[:, axis]
-        for axis, one in enumerate(counts)
-    )
-    whole = replace(grid, lines=(x - x[0], y[0] - y))
-    return Located(whole, plane, Placement(index, _MIRRORED, (first[0], first[1] + rows - 1)), ink)
+    lines_c, lines_r = first[0] + np.arange(-1.0, cols + 1), first[1] + np.arange(-1.0, rows + 1)
+    placement = Placement(index, ((1, 0), (0, 1)), first)
+    if not plane.downwards:  # the plane's y points upwards, the grid's rows downwards
+        cell, dark = np.stack([cell[:, 0], rows - 2 - cell[:, 1]], axis=-1), dark[:, ::-1]
+        lines_r = lines_r[::-1]
+        placement = Placement(index, _MIRRORED, (first[0], first[1] + rows - 1))
+    x = plane.spread(np.column_stack([lines_c, 0 * lines_c]))[:, 0]
+    y = plane.spread(np.column_stack([0 * lines_r, lines_r]))[:, 1]
+    ink = Ink(cell, within, np.where(dark, -1.0, 1.0), -np.ones(len(cell)))
+    return Located(replace(grid, lines=(x - x[0], np.abs(y - y[0]))), plane, placement, ink)
 
 
 def _told(plane: Plane, placed: Placed, grid: Grid) -> str:
@@ -128,7 +130,7 @@ def _told(plane: Plane, placed: Placed, grid: Grid) -> str:
         words.append(f"the markers are of {smallest(placed.marks.dictionary, placed.cells)}")
     if markers.legacy is None and placed.how.legacy:
         words.append("the board has the legacy pattern, whose first square is light")
-    if grid.paired:
+    if grid.paired and not (isinstance(plane, TagPlane) and plane.downwards):
         words.append("there are no squares at the corners of the tags, so only their edges are measured")
     return "; ".join(words)
 
