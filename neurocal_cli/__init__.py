@@ -19,15 +19,13 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.drift import Drift, find_drift
     from neurocal_cli.calibration.evaluation import evaluate_camera
     from neurocal_cli.calibration.rig.advice import advise_rig
-    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_stereo
+    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig, calibrate_stereo, fit_stereo
     from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
     from neurocal_cli.calibration.rig.many_views import triangulate_many
     from neurocal_cli.calibration.rig.rectification import rectify
-    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.calibration.rig.rig_drift import RigDrift, find_rig_drift
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import triangulate
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.fit import fit_lens, fit_lens_cameras
@@ -68,7 +66,7 @@ _HOMES = {
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
     "Pose": "camera.pinhole",
-    "StereoRig": "calibration.rig.stereo_rig",
+    "StereoRig": "calibration.rig.rig",
     "Target": "observations.target",
     "Verdict": "calibration.calibration",
     "ZoomLens": "calibration.zoom.zoom_lens",
@@ -76,7 +74,7 @@ _HOMES = {
     "advise_rig": "calibration.rig.advice",
     "calibrate": "calibration.calibrate",
     "calibrate_rig": "calibration.rig.calibrate_rig",
-    "calibrate_stereo": "calibration.rig.calibrate_stereo",
+    "calibrate_stereo": "calibration.rig.calibrate_rig",
     "camera_at": "calibration.zoom.zoom_lens",
     "detect_points": "detection.detect",
     "evaluate_camera": "calibration.evaluation",
@@ -90,7 +88,7 @@ _HOMES = {
     "RigDrift": "calibration.rig.rig_drift",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
-    "fit_stereo": "calibration.rig.calibrate_stereo",
+    "fit_stereo": "calibration.rig.calibrate_rig",
     "plot": "commands.show.results",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_yaml",

@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.resizing import Resizing
 from neurocal_cli.observations.points import Correspondences

@@ -19,8 +19,7 @@ from neurocal_cli.errors import FormatError, InputError, UsageError
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.calibration.rig.triangulation import Method
     from neurocal_cli.camera.measured import PlaneErrors
     from neurocal_cli.observations.points import Correspondences

@@ -21,8 +21,7 @@ from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back, wr
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 

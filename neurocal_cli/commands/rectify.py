@@ -18,7 +18,7 @@ from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rectification import RectifiedPair, RowError
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import StereoRig
     from neurocal_cli.camera.remapping import Remapping
     from neurocal_cli.files.exchange.camera_set import CameraSet
     from neurocal_cli.observations.points import Correspondences

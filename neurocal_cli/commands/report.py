@@ -14,8 +14,7 @@ from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.files.tree_fields import Field
 
 _MOST_BYTES = 1_400_000  # of all photographs; encoded as text they take a third more

@@ -281,7 +281,7 @@ def stereo(
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
     preparation.check((*inputs, board), (output, html, *ros_files), plots=files_of(plots), as_json=as_json)
-    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
     from neurocal_cli.commands.show.rig_report import stereo_json, stereo_report, views_alone
     from neurocal_cli.files.result_files import write_result
 

@@ -17,8 +17,7 @@ from neurocal_cli.files.writing import write_chunks
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.calibration.rig.triangulation import Triangulated
     from neurocal_cli.camera.measured import PlanePoints
     from neurocal_cli.files.measurement_csv import Batch, Matches
@@ -277,7 +276,7 @@ def _rig(names: tuple[str, ...]) -> StereoRig:
         rig = read_stereo_rig(names[0])
         preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
-    from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+    from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
     from neurocal_cli.files.calibration_yaml import read_calibration
 
     left, right = (read_calibration(name) for name in names)

@@ -18,8 +18,7 @@ from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 
 
 def write_calibration(cal: Calibration, path: str | Path) -> None:
@@ -73,7 +72,7 @@ def write_result(
 
 
 def _rig_text(rig: StereoRig | Rig, alpha: float | None, by_rows: bool) -> str:
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import StereoRig
     from neurocal_cli.files.rig_yaml import format_stereo_rig
 
     if isinstance(rig, StereoRig):

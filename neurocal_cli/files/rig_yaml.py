@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration.rig.rectification import Rectification, rectify
-from neurocal_cli.calibration.rig.rig import Rig, of_two
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError

@@ -18,10 +18,9 @@ from neurocal_cli.adjustment.open_choices import SpreadOfOpen, open_stretch, spr
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.rig import covariance
-from neurocal_cli.calibration.rig.adjust import adjust_rig
-from neurocal_cli.calibration.rig.combine import stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.covariance import covariance_of_stretch
-from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.network.options import options_for

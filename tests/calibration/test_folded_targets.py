@@ -13,7 +13,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.adjustment.board.prior import gauge_of, nearest_to_given
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.commands.show.camera_report import target_json, target_lines
 from neurocal_cli.errors import NeurocalError

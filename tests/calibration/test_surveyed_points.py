@@ -22,7 +22,7 @@ from neurocal_cli.adjustment.board.prior import Prior, surveyed_prior
 from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.points_csv import write_points

@@ -19,7 +19,7 @@ from neurocal_cli import Board, calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import evaluate_camera
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.board_yaml import format_board, parse_board

@@ -27,7 +27,7 @@ from neurocal_cli import (
     write_rig,
 )
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify_points, row_error
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array

@@ -18,7 +18,7 @@ from support.rigs import random_rig, sides
 
 from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration.calibration import Rejected, Verdict
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 from neurocal_cli.commands.show.html_page import (
     board_shape,

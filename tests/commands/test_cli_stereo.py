@@ -16,7 +16,7 @@ from support.rigs import RigScene, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Board, Correspondences, calibrate, read_stereo_rig, write_calibration, write_points
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.files.board_yaml import write_board
 from neurocal_cli.observations.board import Plane
 

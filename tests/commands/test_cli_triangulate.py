@@ -15,8 +15,8 @@ from support.command_line import run
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.result_files import write_rig

@@ -16,9 +16,9 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import NeurocalError, write_calibration, write_points
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.commands.show import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
 from neurocal_cli.commands.show.camera_panels import Subject
 from neurocal_cli.commands.show.plot_pages import draw_camera, draw_points_in_space, draw_stereo

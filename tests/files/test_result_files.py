@@ -23,7 +23,7 @@ from neurocal_cli import (
     write_points,
     write_rig,
 )
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_result

@@ -13,8 +13,8 @@ from support.rigs import random_rig
 
 from neurocal_cli import calibrate
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.result_files import write_rig
 from neurocal_cli.files.rig_yaml import format_stereo_rig, read_stereo_rig

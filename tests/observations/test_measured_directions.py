@@ -19,7 +19,7 @@ from neurocal_cli.adjustment.residual_correlation import correlation
 from neurocal_cli.adjustment.views import arrange, noise_model
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.collinear_points import find_lines
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics

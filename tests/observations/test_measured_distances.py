@@ -12,7 +12,7 @@ from support.places import SAMPLES
 from support.targets import COLS, ROWS, board, offsets, photographed_pair
 
 from neurocal_cli import Board, calibrate, read_board, read_calibration, read_points
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.board_yaml import format_board, parse_board, write_board
 from neurocal_cli.files.calibration_yaml import format_calibration

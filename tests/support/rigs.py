@@ -8,8 +8,7 @@ import numpy as np
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose
 from neurocal_cli.adjustment.reprojection import residuals
-from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.state import RigState
+from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.camera.distortion import Distortion, distort
 from neurocal_cli.camera.geometry import Array
 

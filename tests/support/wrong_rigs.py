@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate, fit_stereo
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.camera.geometry import Array, rotation_step, rotation_vector
 from neurocal_cli.errors import NeurocalError
 from support.rigs import RigScene, corner, random_rig

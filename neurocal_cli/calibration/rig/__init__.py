@@ -1,1 +1,1 @@
-"""Two cameras: pairing of their views and points, calibration of their rig, triangulation."""
+"""Cameras that are fixed to each other: calibration of their rig, its verdict, triangulation."""

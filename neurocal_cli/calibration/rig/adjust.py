@@ -1,7 +1,12 @@
-"""The common bundle adjustment of a rig, and how much its frames contradict each other."""
+"""The common bundle adjustment of calibrated cameras with common frames.
+
+`rig_problem` makes one problem of them, in which each camera has the noise that it has alone. `scatter` tells
+how much the frames contradict each other.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,20 +14,132 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
+from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
-from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
-from neurocal_cli.calibration.rig.combine import cost_alone
-from neurocal_cli.calibration.rig.problem import (
-    RigProblem,
+from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SharedAndOwn, solve_scaled
+from neurocal_cli.adjustment.reprojection import (
+    POSE_COLUMNS,
+    free_columns,
+    normal_blocks,
 )
-from neurocal_cli.calibration.rig.state import RigState
+from neurocal_cli.adjustment.views import Views, batches_of
+from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
+from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.calibration.rig.problem import (
+    Frames,
+    Observations,
+    RigProblem,
+    RigState,
+)
 from neurocal_cli.calibration.verdict.findings import TOLD
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, orthonormalised
+from neurocal_cli.camera.geometry import Array, median, orthonormalised
+from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 
 # A state, its normal equations, and those of the unknowns that move.
 _Linearised = tuple[RigState, Arrowhead, Arrowhead]
+
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
+
+
+# Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
+# test_without_noise_the_truth_comes_back checks such data.
+_LEAST_SHARE = 1e-3
+_LEAST_NOISE = 1e-12
+
+
+def rig_problem(calibrations: Sequence[Calibration], frames: Frames) -> RigProblem:
+    """Combine calibrations with one world unit; the frames are numbered from 0, without gaps."""
+    # Covariances of the points count as far as the residuals confirm them.
+    arranged = [weighed(camera.points, evaluate_camera(camera).residuals) for camera in calibrations]
+    V = 1 + max(int(frame.max()) for frame in frames)
+    centre, scale = np.empty((V, 3)), np.empty(V)
+    basis, extent, is_flat = np.empty((V, 3, 3)), np.empty((V, 3)), np.empty(V, dtype=bool)
+    for own, frame in reversed(list(zip(arranged, frames, strict=True))):
+        centre[frame], scale[frame] = own.centre, own.scale
+        basis[frame], extent[frame], is_flat[frame] = own.basis, own.extent, own.nearly_flat
+    sides = [
+        _side(camera, own, centre[which], scale[which], which)
+        for camera, own, which in zip(calibrations, arranged, frames, strict=True)
+    ]
+    seen, states, normals, noise = zip(*sides, strict=True)
+    real = [observed.pixel_scale * s for observed, s in zip(seen, noise, strict=True)]
+    weights = [
+        1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2 for s, own in zip(noise, real, strict=True)
+    ]
+    return RigProblem(
+        calibrations=tuple(calibrations),
+        names=tuple(own.names for own in arranged),
+        centre=centre,
+        scale=scale,
+        unit=float(median(scale)),
+        observations=tuple(replace(one, weight=weight) for one, weight in zip(seen, weights, strict=True)),
+        cameras=states,
+        own_normal=tuple(weight * normal for weight, normal in zip(weights, normals, strict=True)),
+        basis=basis,
+        extent=extent,
+        is_flat=is_flat,
+    )
+
+
+def stereo_problem(left: Calibration, right: Calibration, pairs: Sequence[tuple[str, str]]) -> RigProblem:
+    """Combine two calibrations, of which some views are paired by their names."""
+    place = {name: k for k, name in enumerate(left.points.view_names)}
+    partner = {b: place[a] for a, b in pairs}
+    frame, end = [], len(place)
+    for name in right.points.view_names:
+        frame.append(partner.get(name, end))
+        end += name not in partner
+    return rig_problem((left, right), (np.arange(len(place)), np.array(frame)))
+
+
+def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and the distortion coefficients a common fit may move.
+
+    With a distortion from straight lines none is, as camera and distortion belong together.
+    """
+    return estimated_parameters(calibration) & (calibration.straight_lines is None)
+
+
+def _side(
+    calibration: Calibration, views: Views, centre: Array, scale: Array, frame: NDArray[np.intp]
+) -> tuple[Observations, CameraState, Array, float]:
+    """Normalised observations of one camera (without weight), its state, normal matrices and noise.
+
+    `centre` (V_c, 3) and `scale` (V_c,) are those of the views' frames.
+    """
+    local = views.local * np.repeat(views.scale / scale, views.counts)[:, None]
+    local += np.repeat((views.centre - centre) / scale[:, None], views.counts, axis=0)
+    batches = batches_of(local, views.pixels, views.whitening, views.index, views.n_views)
+    entries = calibration.K[ENTRIES]
+    entries[3:] -= views.pixel_centre
+    poses = [calibration.views[name].pose for name in views.names]
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    state = CameraState(
+        entries[None] / views.pixel_scale,
+        R,
+        ((R @ centre[..., None])[..., 0] + t) / scale[:, None],
+        calibration.distortion_model,
+        np.array(calibration.distortion, dtype=float),
+        calibration.square_pixels,
+    )
+    normal, free = normal_blocks(batches, state)[0], free_parameters(calibration)
+    spare = views.n_equations - int(free.sum()) - 6 * views.n_views
+    noise = max(float(np.sqrt(cost_alone(normal, free) / max(spare, 1))), _LEAST_NOISE)
+    observed = Observations(batches, frame, views.pixel_centre, views.pixel_scale, 1.0, views.n_equations)
+    return observed, state, normal, noise
+
+
+def cost_alone(normal: Array, free: NDArray[np.bool_]) -> float:
+    """Sum of squares of one camera at its own minimum, to which one step leads.
+
+    `normal` (V, 12 + K, 12 + K) are its `normal_blocks` in any poses near it, such as those of a common fit,
+    and `free` (5 + K,) are its parameters that move.
+    """
+    reduced, _ = Arrowhead.of(normal, free_columns(free), POSE_COLUMNS).reduced()
+    gained = reduced[-1, :-1] @ solve_scaled(reduced[:-1, :-1], reduced[:-1, -1:], ROUNDING)[:, 0]
+    return max(float(reduced[-1, -1] - np.nan_to_num(gained)), 0.0)
 
 
 @frozen_dataclass(eq=False)

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import RigFit
-from neurocal_cli.calibration.rig.assessment import fitted
-from neurocal_cli.calibration.rig.point_moves import shared_covariance
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, shared_covariance
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, median

@@ -3,9 +3,9 @@
 Everything is computed from the rig and its points, so a file can be judged like a fresh result:
 
 * the verdict on each camera by its own points (`calibration.verdict.assessment`);
-* whether the frames agree on one rig, and if not, the cause (`rivals`);
+* whether the frames agree on one rig, and if not, the cause (`causes`);
 * the cross-validation error over frames;
-* the uncertainty of the cameras' positions, and of the depth of triangulated points (`depth`).
+* the uncertainty of the cameras' positions, and of the depth of triangulated points (`space_uncertainty`).
 """
 
 from __future__ import annotations
@@ -19,17 +19,13 @@ from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
-from neurocal_cli.calibration.rig.causes import EACH_PART, SAME_MOMENT, TAKEN, Named
-from neurocal_cli.calibration.rig.combine import rig_problem
+from neurocal_cli.calibration.rig.adjust import RigFit, scatter
+from neurocal_cli.calibration.rig.causes import EACH_PART, SAME_MOMENT, TAKEN, Named, named_cause
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, UNSYNCHRONISED
-from neurocal_cli.calibration.rig.depth import depth_std
 from neurocal_cli.calibration.rig.edges import described, pair_name
-from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.problem import ViewEquations
-from neurocal_cli.calibration.rig.rig import Rig, of_two
-from neurocal_cli.calibration.rig.rivals import named_cause
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
+from neurocal_cli.calibration.rig.space_uncertainty import depth_std, fitted, has_points
 from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
@@ -87,12 +83,6 @@ def assess_rig(rig: Rig) -> Verdict | None:
     return verdict_of(_findings(rig, evidence), measures)
 
 
-def has_points(rig: Rig) -> bool:
-    """Whether a rig has the points that it was calibrated from."""
-    whole = all(set(camera.points.view_names) == set(camera.views) for camera in rig.cameras.values())
-    return whole and bool(rig.frames) and all(len(camera.points) for camera in rig.cameras.values())
-
-
 def assess_stereo(rig: StereoRig) -> Verdict | None:
     """The same for a left and a right camera."""
     return assess_rig(of_two(rig))
@@ -123,37 +113,6 @@ def _evidence(rig: Rig) -> _Evidence:
         depth_share=_typical(std / depth),
         one_place=one_place,
     )
-
-
-def fitted(rig: Rig) -> RigFit:
-    """The rig at its minimum, with the poses of its cameras and frames as unknowns."""
-    frame_of: dict[tuple[str, str], int] = {
-        (camera, view): k for k, views in enumerate(rig.frames.values()) for camera, view in views.items()
-    }
-    end, of_views = len(rig.frames), []
-    for name, camera in rig.cameras.items():
-        own = []
-        for view in camera.points.view_names:
-            frame = frame_of.get((name, view), -1)
-            if frame < 0:
-                frame, end = end, end + 1
-            own.append(frame)
-        of_views.append(np.array(own, dtype=np.intp))
-    problem = rig_problem(list(rig.cameras.values()), of_views)
-    state = problem.start(list(rig.poses.values())[1:])
-    if rig.delays:
-        motion = motion_of(problem, state, _times(rig)) or motion_of(problem, state, None)
-        if motion is not None:
-            delay = np.array([rig.delays.get(name, (0.0, 0.0))[0] for name in rig.cameras])
-            problem = replace(problem, motion=motion)
-            state = replace(state, delay=delay, timed=True)
-    return adjust_rig(problem, state, problem.estimated_shared)
-
-
-def _times(rig: Rig) -> list[Array] | None:
-    times = [camera.points.view_times for camera in rig.cameras.values()] if rig.timed else []
-    known = [one for one in times if one is not None]
-    return known if times and len(known) == len(times) else None
 
 
 @quietly

@@ -50,8 +50,7 @@ from neurocal_cli.adjustment.open_choices import (
 )
 from neurocal_cli.adjustment.reprojection import camera_columns
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
-from neurocal_cli.calibration.rig.problem import Observations, RigProblem
-from neurocal_cli.calibration.rig.state import RigState
+from neurocal_cli.calibration.rig.problem import Observations, RigProblem, RigState
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target

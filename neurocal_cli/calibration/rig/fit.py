@@ -12,17 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
-from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
 from neurocal_cli.calibration.rig.assessment import assess_rig
-from neurocal_cli.calibration.rig.board import with_board
-from neurocal_cli.calibration.rig.causes import LATE_CAMERA, TAKEN, TWO_GEOMETRIES
-from neurocal_cli.calibration.rig.changes import is_common, of_rig, seen_again
-from neurocal_cli.calibration.rig.combine import rig_problem
-from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED
+from neurocal_cli.calibration.rig.causes import TAKEN
+from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, with_agreeing_poses
+from neurocal_cli.calibration.rig.contradictions import LeftOut, told_left_out, without_contradictions
 from neurocal_cli.calibration.rig.covariance import (
     contradicting_covariance,
     covariance_of_stretch,
@@ -31,31 +27,21 @@ from neurocal_cli.calibration.rig.covariance import (
 )
 from neurocal_cli.calibration.rig.edges import (
     Edge,
-    at_fit,
     connected,
-    described,
     examined,
-    fitting,
-    is_suspect,
-    pair_name,
     views_left_out,
 )
-from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames, refuse_apart
-from neurocal_cli.calibration.rig.motion import timed
+from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.refinement import adjusted
+from neurocal_cli.calibration.rig.refinement import with_board
 from neurocal_cli.calibration.rig.result import RigAssembly
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.rivals import log_evidence, named_cause
-from neurocal_cli.calibration.verdict.findings import LEVEL, TOLD
+from neurocal_cli.calibration.verdict.findings import TOLD
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 
 _HERE = Pose(np.eye(3), np.zeros(3))
-_TRIES = 2  # for the place and the kind of a change
-
-_LeftOut = dict[tuple[int, str], str]  # views, by the index of the camera, and why
 
 
 def fit_rig(
@@ -101,10 +87,10 @@ def fit_rig(
     start = connected(edges, names)
     _refuse_poor_camera(edges, names)
     left_out = views_left_out(edges, problem)
-    fit, left_out, warnings = _without_contradictions(problem, start, left_out, refine_cameras, names)
+    fit, left_out, warnings = without_contradictions(problem, start, left_out, refine_cameras, names)
     _refuse_if_most_contradict(left_out, problem, names)
     if outliers == "keep" and left_out:
-        told = _told(left_out, problem, names)
+        told = told_left_out(left_out, problem, names)
         raise DegenerateGeometryError(f"{told}; remove them, or use --outliers reject")
     target = cameras[names[0]].target
     common = target is not None and all(camera.target is target for camera in cameras.values())
@@ -122,7 +108,7 @@ def fit_rig(
         fit = replace(fit, problem=replace(fit.problem, calibrations=kept))
     rig = _assembled(fit, names, least, None if stretched is None else stretched[1])
     if left_out:
-        warnings.insert(0, _told(left_out, problem, names))
+        warnings.insert(0, told_left_out(left_out, problem, names))
     rig = replace(
         rig,
         left_out={(names[c], view): why for (c, view), why in left_out.items()},
@@ -131,100 +117,6 @@ def fit_rig(
     )
     _refuse_one_place(rig)
     return rig
-
-
-def _without_contradictions(
-    problem: RigProblem, start: Sequence[Pose], left_out: _LeftOut, refine_cameras: bool, names: list[str]
-) -> tuple[RigFit, _LeftOut, list[str]]:
-    """The common fit, the views that it leaves out, and its warnings."""
-    times = _times(problem)
-    told = [f"{name} camera" if name in ("left", "right") else f"camera {name}" for name in names]
-
-    def fitted() -> tuple[RigFit, list[str]]:
-        within = _detached(problem, left_out, names)
-        fit, warnings = adjusted(within, within.start(start), refine_cameras, told)
-        moving = with_delays(fit, times, names)
-        return (
-            (fit, warnings) if moving is fit else adjusted(moving.problem, moving.state, refine_cameras, told)
-        )
-
-    fit, warnings = fitted()
-    if suspects := _suspects(left_out):
-        # The others tell whether the suspects have a cause in common, or which of them fit after all.
-        still = at_fit(_detached(problem, _named(left_out), names), fit)
-        found = named_cause(still, names, free=of_rig(still))[0]
-        common = found is not None and is_common(found, still, fit, len(suspects))
-        if held := suspects if common else suspects & set(_views(problem, fitting(still))):
-            left_out = {view: why for view, why in left_out.items() if view not in held}
-            fit, warnings = fitted()
-    for _ in names:
-        found = named_cause(fit, names)[0]
-        if found is None or found.cause not in TWO_GEOMETRIES:
-            break
-        before = left_out
-        for _ in range(_TRIES):
-            why = f"{TAKEN} {'after' if found.is_late else 'before'} {found.text}"
-            left_out = before | dict.fromkeys(_views(problem, found.apart), why)
-            fit, warnings = fitted()
-            again = seen_again(_detached(problem, before, names), fit, found)
-            if again.text == found.text:
-                break
-            found = again
-    if left_out.keys() > (suspects := _suspects(left_out)):  # without the others, some may fit
-        still = at_fit(_detached(problem, _named(left_out), names), fit)
-        if held := suspects & set(_views(problem, fitting(still))):
-            left_out = {view: why for view, why in left_out.items() if view not in held}
-            fit, warnings = fitted()
-    return fit, left_out, warnings
-
-
-def _detached(problem: RigProblem, left_out: Mapping[tuple[int, str], str], names: list[str]) -> RigProblem:
-    """The problem without the views that are left out of the rig; each camera must still be in it."""
-    apart = [
-        np.array([(c, name) in left_out for name in own], dtype=bool) for c, own in enumerate(problem.names)
-    ]
-    found = problem.detached(apart)
-    member = np.zeros((len(names), len(found.scale)), dtype=int)
-    for row, observed in zip(member, found.observations, strict=True):
-        row[observed.view[found.together[observed.view]]] = 1
-    if not (member.sum(axis=1) > 0).all():
-        lost = names[int(np.argmin(member.sum(axis=1)))]
-        raise DegenerateGeometryError(
-            f"no view connects camera {lost}: {_told(left_out, problem, names)}; check that the views of a "
-            "frame show one target at one moment, in the same order"
-        )
-    refuse_apart(names, member @ member.T > 0)
-    return found
-
-
-def _views(problem: RigProblem, chosen: Sequence[NDArray[np.bool_]]) -> list[tuple[int, str]]:
-    """The chosen views of each camera, (V_c,) bool, by the index of the camera and by name."""
-    return [
-        (c, view)
-        for c, (own, which) in enumerate(zip(problem.names, chosen, strict=True))
-        for view, is_in in zip(own, which, strict=True)
-        if is_in
-    ]
-
-
-def _suspects(left_out: Mapping[tuple[int, str], str]) -> set[tuple[int, str]]:
-    """The other ones."""
-    return {view for view, why in left_out.items() if is_suspect(why)}
-
-
-def _named(left_out: Mapping[tuple[int, str], str]) -> dict[tuple[int, str], str]:
-    """The views with a fault that has a name."""
-    return {view: why for view, why in left_out.items() if not is_suspect(why)}
-
-
-def _told(left_out: Mapping[tuple[int, str], str], problem: RigProblem, names: Sequence[str]) -> str:
-    """The views that are left out, of two cameras by pairs, and why."""
-    if len(names) == 2:
-        pairs = {pair: left_out[0, pair[0]] for pair in problem.pairs if (0, pair[0]) in left_out}
-        faults = {pair_name(pair): why for pair, why in pairs.items()}
-        return described(faults, len(problem.paired), "pairs of views")
-    n = sum(int(problem.together[observed.view].sum()) for observed in problem.observations)
-    return described({f"{names[c]}/{view}": why for (c, view), why in left_out.items()}, n, "views")
 
 
 def _refuse_poor_camera(edges: Sequence[Edge], names: Sequence[str]) -> None:
@@ -241,12 +133,12 @@ def _refuse_poor_camera(edges: Sequence[Edge], names: Sequence[str]) -> None:
             )
 
 
-def _refuse_if_most_contradict(left_out: _LeftOut, problem: RigProblem, names: Sequence[str]) -> None:
+def _refuse_if_most_contradict(left_out: LeftOut, problem: RigProblem, names: Sequence[str]) -> None:
     """Refuse two cameras of which half of the pairs contradict the others for no change of the rig."""
     odd = [why for (c, _), why in left_out.items() if c == 0 and not why.startswith(TAKEN)]
     if len(names) > 2 or 2 * len(odd) < len(problem.paired):
         return
-    told = _told(left_out, problem, names)
+    told = told_left_out(left_out, problem, names)
     if not set(odd).isdisjoint(SHIFTED.values()):
         raise DegenerateGeometryError(f"{told}; {PAIR_ANEW}")
     raise DegenerateGeometryError(
@@ -264,33 +156,6 @@ def _refuse_one_place(rig: Rig) -> None:
             f"{pair.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two "
             "different cameras"
         )
-
-
-def _times(problem: RigProblem) -> list[Array] | None:
-    """Times of each camera's views, if all are known."""
-    times = [camera.points.view_times for camera in problem.calibrations]
-    known = [one for one in times if one is not None]
-    return known if len(known) == len(times) else None
-
-
-def with_delays(fit: RigFit, times: Sequence[Array] | None, names: Sequence[str]) -> RigFit:
-    """The fit with the motion of the target and the delays of the cameras, if the frames show them.
-
-    Delays are tried where they are the cause of the contradictions, stated times wherever they are known.
-    """
-    squares, degrees = scatter(fit)
-    if not is_significant(squares, degrees):
-        return fit
-    found, _ = named_cause(fit, names)
-    late = found is not None and found.cause is LATE_CAMERA
-    best, most = fit, LEVEL
-    for stated in ([times] if times is not None else []) + ([None] if late else []):
-        trial = timed(fit, stated)
-        if trial is not None:
-            evidence = log_evidence(squares, scatter(trial)[0], degrees, len(names) - 1)
-            if evidence > most:
-                best, most = trial, evidence
-    return best
 
 
 def _covariance(fit: RigFit) -> Array | None:

@@ -2,6 +2,16 @@
 
 Views of one name are one frame. If no two cameras have a name in common, names are compared without the name
 of the camera, and without words such as ``cam0`` or ``left`` (``cam2_017`` and ``cam3_017`` are one frame).
+
+Pairing of the views and the points of two cameras.
+
+Views with equal names are a pair. If the cameras have no name in common, names are compared without the word
+for the side: ``left``, ``l`` or ``cam0`` in names of the left camera, ``right``, ``r`` or ``cam1`` in names
+of the right one. The word may have any case and must not be next to other letters (``left01`` and
+``right01``, ``IMG_L_07`` and ``IMG_R_07``, ``cam0-3`` and ``cam1-3``); but one with a capital may follow a
+small letter (``imageL0`` and ``imageR0``). The order of the views never matters.
+
+The points of a pair of views are paired by their ids or, if one of the files has none, by X, Y, Z.
 """
 
 from __future__ import annotations
@@ -12,15 +22,194 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import planes_are_named
 from neurocal_cli.observations.labels import first_moved
 from neurocal_cli.observations.points import Correspondences
 
 _ANY_CAMERA = r"cam(?:era)?[ _-]?[0-9]+(?![0-9])|left|right"
+
+
+_SIDES = (
+    re.compile(
+        r"(?<![a-z])(?:left|l(?![a-z])|cam(?:era)?[ _-]?0(?![0-9]))(?![a-z])"
+        r"|(?-i:(?<=[a-z])L(?:eft)?(?![A-Za-z]))",
+        re.IGNORECASE,
+    ),
+    re.compile(
+        r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])"
+        r"|(?-i:(?<=[a-z])R(?:ight)?(?![A-Za-z]))",
+        re.IGNORECASE,
+    ),
+)
+_LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coincidence
+_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as a share of the target's size
+
+
+@frozen_dataclass
+class ViewPairs:
+    """Names of paired and of single views."""
+
+    both: tuple[tuple[str, str], ...]  # left and right, in the order of the left camera
+    left_only: tuple[str, ...] = ()
+    right_only: tuple[str, ...] = ()
+
+
+@frozen_dataclass(eq=False)
+class Pairs:
+    """Points of both cameras: rows of each camera's points (N,), and the pair of views of each."""
+
+    left: NDArray[np.intp]
+    right: NDArray[np.intp]
+    view: NDArray[np.intp]  # (N,) number of the pair, sorted
+
+
+def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
+    """Pair the names of two cameras' views.
+
+    Errors are no view, no pair, ambiguous names, and names that show that the cameras are swapped.
+    """
+    for side, names in (("left", left), ("right", right)):
+        if not names:
+            raise InputError(
+                f"the calibration of the {side} camera has no points of its own; give a file that was not "
+                "written with --lean"
+            )
+    if not set(left).isdisjoint(right):
+        keys = dict(zip(left, left, strict=True)), dict(zip(right, right, strict=True))
+    else:
+        crossed = [name for name in left if _SIDES[1].search(name) and not _SIDES[0].search(name)]
+        other = [name for name in right if _SIDES[0].search(name) and not _SIDES[1].search(name)]
+        if len(crossed) == len(left) and len(other) == len(right):
+            raise InputError(
+                f"the cameras are swapped: the left one's views are {_listed(crossed)}, the right one's "
+                f"{_listed(other)}; give the left camera first"
+            )
+        keys = _keys(left, _SIDES[0]), _keys(right, _SIDES[1])
+    both = tuple((name, keys[1][key]) for key, name in keys[0].items() if key in keys[1])
+    if not both:
+        raise InputError(
+            f"no view of the left camera has a partner in the right one: left has {_listed(left)}, right has "
+            f"{_listed(right)}; give views taken together the same name, or names such as left01 and "
+            "right01, in which left and right touch no other letter"
+        )
+    paired = set(sum(both, ()))
+    return ViewPairs(
+        both,
+        tuple(name for name in left if name not in paired),
+        tuple(name for name in right if name not in paired),
+    )
+
+
+def _keys(names: Sequence[str], side: re.Pattern[str]) -> dict[str, str]:
+    """Names by their rest without the word for the side; names without such a word are left out."""
+    keys: dict[str, str] = {}
+    for name in names:
+        key, found = side.subn("", name)
+        key = re.sub(r"[\W_]+", "_", key).strip("_")
+        if not found:
+            continue
+        if key in keys:
+            raise InputError(
+                f"the views {keys[key]!r} and {name!r} are both {key!r} without the name of the camera; give "
+                "views taken together by the two cameras the same name"
+            )
+        keys[key] = name
+    return keys
+
+
+def _listed(names: Sequence[str]) -> str:
+    return name_some(repr(name[:60]) for name in names)
+
+
+def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs) -> Pairs:
+    """Pair the points of paired views.
+
+    Errors are different units, no common point, ids of different places, and several points at one place.
+    """
+    if left.unit != right.unit:
+        raise InputError(
+            f"{left.source} is in {left.unit}, {right.source} in {right.unit}; give both in the same unit"
+        )
+    sides = _in_pairs(left, [a for a, _ in views.both]), _in_pairs(right, [b for _, b in views.both])
+    rows, order = zip(*sides, strict=True)
+    by_id = left.point is not None and right.point is not None
+    if by_id:
+        ids = [np.asarray(side.point)[row].astype(str) for side, row in zip((left, right), rows, strict=True)]
+        codes = np.unique(np.concatenate(ids), return_inverse=True)[1].reshape(-1)
+    else:
+        codes = _place_codes(np.concatenate([left.world[rows[0]], right.world[rows[1]]]))
+    n_codes = 1 + int(codes.max(initial=0))
+    parts = np.split(codes, [len(rows[0])])
+    keys = [view * n_codes + code for view, code in zip(order, parts, strict=True)]
+    if not by_id:  # no view has an id twice
+        for points, row, key in zip((left, right), rows, keys, strict=True):
+            _refuse_repeated(points, row, key)
+    common, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
+    if not common.size or (not by_id and len(common) < _LEAST_COMMON * min(map(len, rows))):
+        what, few = "id" if by_id else "X, Y, Z", f"{len(common)} points" if common.size else "no point"
+        raise InputError(
+            f"{left.source} and {right.source}: the paired views have {few} in common, by {what}; measure "
+            "the same target in both, in the same coordinates and unit"
+        )
+    pairs = Pairs(rows[0][first], rows[1][second], common // n_codes)
+    if by_id:
+        _refuse_moved(left, right, pairs)
+    return pairs
+
+
+def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of paired views, and the number of the pair of each."""
+    place = {name: k for k, name in enumerate(names)}
+    pair = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
+    rows = np.flatnonzero(pair >= 0)
+    return rows, pair[rows]
+
+
+def _place_codes(world: Array) -> NDArray[np.intp]:
+    """An integer for each place in the world (N, 3), equal for places that differ by rounding only."""
+    size = float(np.ptp(world, axis=0).max(initial=0.0)) or 1.0
+    codes = np.zeros(len(world), dtype=np.intp)
+    for column in world.T:
+        values = np.sort(column)
+        # A new value begins after every gap larger than rounding.
+        starts = values[np.concatenate([[True], np.diff(values) > _SAME_PLACE * size])]
+        codes = codes * len(starts) + np.searchsorted(starts, column, side="right") - 1
+        codes = np.unique(codes, return_inverse=True)[1].reshape(-1)  # small, so no product overflows
+    return codes
+
+
+def _refuse_repeated(points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp]) -> None:
+    order = np.argsort(keys, kind="stable")
+    repeated = np.flatnonzero(np.diff(keys[order]) == 0)
+    if not repeated.size:
+        return
+    first, second = sorted(int(rows[order[repeated[0] + k]]) for k in (0, 1))
+    raise InputError(
+        f"{points.place(second)}: the point is at the same X, Y, Z (in the same view) as "
+        f"{points.place(first)}; remove one of the rows, or give a column point with an id of each point in "
+        "both files"
+    )
+
+
+def _refuse_moved(left: Correspondences, right: Correspondences, pairs: Pairs) -> None:
+    """Refuse ids of different places in the two files."""
+    a, b = left.world[pairs.left], right.world[pairs.right]
+    apart = np.abs(a - b).max(axis=1)
+    size = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))
+    if not apart.max() > _SAME_PLACE * size:
+        return
+    row = int(np.argmax(apart))
+    assert left.point is not None
+    name = str(left.point[pairs.left[row]])
+    places = [f"({', '.join(f'{x:g}' for x in places[row])})" for places in (a, b)]
+    raise InputError(
+        f"{right.place(int(pairs.right[row]))}: the point {name[:60]!r} is at {places[1]}, but "
+        f"at {places[0]} in {left.source}; use one board and one unit for both cameras"
+    )
 
 
 @frozen_dataclass(eq=False)

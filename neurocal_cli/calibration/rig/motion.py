@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
-from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.state import Motion, RigState
+from neurocal_cli.calibration.rig.problem import Motion, RigProblem, RigState
 from neurocal_cli.camera.geometry import Array, median, rotation_vector
 
 _ROUNDS, _SETTLED = 25, 1e-3  # of paths and adjustment alternately, most of them; relative change of the cost

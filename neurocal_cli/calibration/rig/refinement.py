@@ -1,20 +1,30 @@
-"""The common bundle adjustment with the cameras refined, as far as the frames allow it."""
+"""The common adjustment of a rig with its cameras, as far as the frames allow it, and the target's shape.
+
+The cameras' own views determine the target's shape roughly. What several cameras saw at one moment says more,
+above all how boards stand to each other that no camera sees together. Each round solves for the most probable
+shape with all other unknowns of the rig, moves the points there, and adjusts the rest again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
-from neurocal_cli.calibration.rig.combine import free_parameters
-from neurocal_cli.calibration.rig.problem import RigProblem
+from neurocal_cli.adjustment.board.posterior import minimum_of
+from neurocal_cli.adjustment.board.prior import nearest_to_given, prior_of_target
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, free_parameters, rig_problem
+from neurocal_cli.calibration.rig.covariance import information_of_rig
+from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.calibration.rig.result import non_monotonic_sides
-from neurocal_cli.calibration.rig.state import RigState
 from neurocal_cli.calibration.verdict.findings import CONTRADICTION
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.observations.target import Target, scale_of_points
 
-# Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
-# refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
+_ROUNDS = 6
+_SETTLED = 0.05  # standard deviations; moves of all points that are smaller end the rounds
 
 
 def adjusted(
@@ -32,6 +42,8 @@ def adjusted(
             + [np.ones(problem.n_rig, dtype=bool)]
         )
         fit = adjust_rig(problem, start, free)
+        # A larger rms residual, in units of that of the cameras alone, is of the frames, and would spoil the
+        # cameras: test_pairs_that_scatter_do_not_spoil_the_cameras.
         if any(moving) and np.sqrt(fit.variance) > CONTRADICTION.good:
             moving = [False] * len(moving)
             warnings = [
@@ -48,3 +60,56 @@ def adjusted(
                 "are no points; the result of its own views is kept; add views that show the board in the "
                 "image's corners"
             )
+
+
+def with_board(fit: RigFit, target: Target, adjusted: Callable[[RigProblem, RigState], RigFit]) -> RigFit:
+    """The fit at the common minimum of the target's shape and all other unknowns, on the moved target.
+
+    `adjusted` is the common adjustment of a problem from a state near its minimum. The fit stays as it is
+    where the points do not determine the shape.
+    """
+    for _ in range(_ROUNDS):
+        moved = _moved(target, fit)
+        if moved is None:
+            return fit
+        move = np.abs(moved.found - target.found) / np.maximum(target.std, 1e-300)
+        fit, target = _on_target(fit, target, moved, adjusted), moved
+        if np.sqrt((move**2).mean()) < _SETTLED:
+            return fit
+    return fit
+
+
+def _moved(target: Target, fit: RigFit) -> Target | None:
+    """The most probable target, all other unknowns following it; None if it is not determined."""
+    prior = prior_of_target(target)
+    info = information_of_rig(target, fit).turned(prior.axes).around_given(prior.along_axes(target.offsets))
+    try:
+        _, offsets = minimum_of(info, prior, target.sizes, fit.variance)
+    except np.linalg.LinAlgError:
+        return None
+    world = target.given + prior.in_world(offsets)
+    if not np.isfinite(world).all():
+        return None
+    s, R, t = nearest_to_given(world, target.given, target.plane)
+    distances = fit.problem.calibrations[0].points.distances
+    held = scale_of_points(s * world @ R.T + t, target.point, distances).factor
+    return replace(target, found=held * (s * world @ R.T + t))
+
+
+def _on_target(
+    fit: RigFit, before: Target, after: Target, adjusted: Callable[[RigProblem, RigState], RigFit]
+) -> RigFit:
+    """The fit with its points on another target."""
+
+    def on_it(camera: Calibration) -> Calibration:
+        return replace(camera, points=after.applied(before.as_given(camera.points)), target=after)
+
+    old = fit.problem
+    new = rig_problem(
+        [on_it(camera) for camera in old.calibrations], [observed.view for observed in old.observations]
+    )
+    new = replace(new, motion=old.motion)
+    state = fit.state
+    turned: Array = (state.view_R @ (new.centre - old.centre)[..., None])[..., 0]
+    view_t = (state.view_t * old.scale[:, None] + turned) / new.scale[:, None]
+    return adjusted(new, replace(state, t=state.t * (old.unit / new.unit), view_t=view_t))

@@ -145,9 +145,8 @@ def _known(rig: Rig) -> dict[str, Pose]:
 
 def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
     """Poses of given frames in the first camera that fit all cameras of the rig best."""
-    from neurocal_cli.calibration.rig.adjust import adjust_rig
-    from neurocal_cli.calibration.rig.combine import rig_problem
-    from neurocal_cli.calibration.rig.several_cameras import with_poses
+    from neurocal_cli.calibration.rig.adjust import adjust_rig, rig_problem
+    from neurocal_cli.calibration.rig.calibrate_rig import with_poses
 
     usable, _ = with_poses(points)
     fits: dict[str, Calibration] = {

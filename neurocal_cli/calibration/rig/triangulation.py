@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rectification import rectify
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.two_view_points import PointBatch, WidePointBatch
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion

@@ -21,14 +21,15 @@ import numpy as np
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.zoom.parameter_networks import are_cameras, local_to_outputs, outputs_to_local
-from neurocal_cli.calibration.zoom.quadratic_error import QuadraticError, inverse
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
     LensPoints,
     PixelData,
+    QuadraticError,
     Tables,
     coefficients_of,
     describe,
+    inverse,
 )
 from neurocal_cli.calibration.zoom.target import on_target
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens

@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration.zoom.camera_errors import error_variances, too_few
 from neurocal_cli.calibration.zoom.initialisation import (
     CalibratedSettings,
     FitOptions,
@@ -21,15 +20,25 @@ from neurocal_cli.calibration.zoom.initialisation import (
     check_settings,
     choose_model,
 )
-from neurocal_cli.calibration.zoom.joint_training import Joint, JointLearner, take_turns, train_joint
-from neurocal_cli.calibration.zoom.parameter_networks import Budget, LensNets, fit_committee, local_to_outputs
-from neurocal_cli.calibration.zoom.result import (
+from neurocal_cli.calibration.zoom.joint_training import (
+    Joint,
+    JointLearner,
     assemble,
     contradiction,
     left_out_errors,
     most_suspect,
     provisional,
     refuse_gaps,
+    take_turns,
+    train_joint,
+)
+from neurocal_cli.calibration.zoom.parameter_networks import (
+    Budget,
+    LensNets,
+    error_variances,
+    fit_committee,
+    local_to_outputs,
+    too_few,
 )
 from neurocal_cli.calibration.zoom.settings import (
     CONTROLS,
@@ -255,7 +264,7 @@ def fit_lens_cameras(
     topologies: tuple[tuple[int, int], ...] | None = None,
     progress: Progress | None = None,
 ) -> ZoomLens:
-    """Fit networks to known cameras; `camera_errors` estimates their noise.
+    """Fit networks to known cameras; `error_variances` estimates their noise.
 
     Raises
     ------

@@ -14,8 +14,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.verdict.findings import ELSEWHERE, ERROR, SHARE, Finding, Limit, verdict_of
-from neurocal_cli.calibration.zoom.camera_errors import odd_camera
-from neurocal_cli.calibration.zoom.parameter_networks import local_to_outputs
+from neurocal_cli.calibration.zoom.parameter_networks import local_to_outputs, odd_camera
 from neurocal_cli.calibration.zoom.settings import describe, middles
 from neurocal_cli.calibration.zoom.zoom_lens import Prediction, ZoomLens
 

@@ -11,13 +11,15 @@ from neurocal_cli.adjustment.observability import MEANINGLESS
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
 from neurocal_cli.calibration.presented import Summarised
 from neurocal_cli.calibration.zoom.parameter_networks import LensNets, are_cameras
-from neurocal_cli.calibration.zoom.quadratic_error import gauss_newton, inverse, with_scatter
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
     Tables,
     coefficients_of,
     describe,
+    gauss_newton,
+    inverse,
     scaled_controls,
+    with_scatter,
 )
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass

@@ -10,8 +10,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import predict
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.space_error import SpaceError
+from neurocal_cli.calibration.rig.evaluation import SpaceError
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.commands.show.figure import ACCENT, picture, style
 from neurocal_cli.commands.show.text import (

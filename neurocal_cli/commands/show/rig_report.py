@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
@@ -29,9 +28,8 @@ from neurocal_cli.commands.show.text import (
 from neurocal_cli.errors import plural
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
+    from neurocal_cli.calibration.rig.evaluation import SpaceError, StereoEvaluation
     from neurocal_cli.calibration.rig.rig_evaluation import RigEvaluation
-    from neurocal_cli.calibration.rig.space_error import SpaceError
 
 _SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_EDGES = 20  # rows of a table that fit on a screen

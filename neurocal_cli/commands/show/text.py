@@ -17,8 +17,7 @@ from neurocal_cli.commands.streams import table_width, verbose
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 
 Table = list[list[str]]
 """Rows of cells, the heading first."""

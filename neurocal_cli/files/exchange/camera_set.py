@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.presented import Converted
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.errors import FormatError, InputError, check_choice, source_of, value_failures

@@ -14,7 +14,7 @@ from support.slow_cases import slow_but
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.calibration.lens_choice import given_model
 from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit, where_not_monotonic
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
 from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
 from neurocal_cli.camera.monotonic import radial_slope
 from neurocal_cli.camera.pinhole import Pose

@@ -7,7 +7,7 @@ import pytest
 from support.real_data import RealFiles
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, fit_stereo, read_points
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import StereoRig
 
 CAMERA = Camera(Intrinsics(1000.0, 1000.0, 639.5, 359.5), image_size=(1280, 720))
 BOARD = np.array([[20.0 * c, 20.0 * r, 0.0] for r in range(3) for c in range(4)]) - [30, 20, 0]

@@ -13,17 +13,15 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Pose, calibrate, calibrate_stereo
 from neurocal_cli.adjustment.reprojection import normal_blocks
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, rig_problem
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-from neurocal_cli.calibration.rig.combine import rig_problem
+from neurocal_cli.calibration.rig.causes import named_cause
 from neurocal_cli.calibration.rig.covariance import covariance_over_frames
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import match_views
 from neurocal_cli.calibration.rig.motion import motion_of, timed
-from neurocal_cli.calibration.rig.problem import RigProblem
+from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.rivals import named_cause
-from neurocal_cli.calibration.rig.state import RigState
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.simulation.rigs import random_rig

@@ -10,7 +10,7 @@ import pytest
 from support.rigs import random_rig, sides
 
 from neurocal_cli import Pose, StereoRig
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError

@@ -13,8 +13,7 @@ from support.many_cameras import SIGMA, Points, scene
 
 from neurocal_cli import Pose, Rig, calibrate_rig, write_rig
 from neurocal_cli.calibration.rig.advice import _Pair, advise_rig
-from neurocal_cli.calibration.rig.assessment import fitted
-from neurocal_cli.calibration.rig.point_moves import shared_covariance
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, shared_covariance
 from neurocal_cli.errors import InputError
 from neurocal_cli.simulation.rigs import SimulatedRig
 

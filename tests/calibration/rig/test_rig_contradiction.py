@@ -12,16 +12,14 @@ from support.slow_cases import slow_but
 from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
 from neurocal_cli import Correspondences, calibrate, fit_stereo
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
-from neurocal_cli.calibration.rig.causes import Named
-from neurocal_cli.calibration.rig.combine import stereo_problem
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter, stereo_problem
+from neurocal_cli.calibration.rig.causes import Named, named_cause
 from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.covariance import not_smaller
-from neurocal_cli.calibration.rig.odd_pairs import RelativePoses, odd_pairs, relative_poses
-from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.edges import RelativePoses, odd_pairs, relative_poses
+from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.rivals import named_cause
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.camera.geometry import rotation_step, rotation_vector
 from neurocal_cli.errors import DegenerateGeometryError

@@ -10,7 +10,7 @@ from support.rigs import RigScene, random_rig, sides
 
 from neurocal_cli import Pose
 from neurocal_cli.calibration.drift import SHARE
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.calibration.rig.rig_drift import find_pose_drift, find_rig_drift
 from neurocal_cli.errors import InputError

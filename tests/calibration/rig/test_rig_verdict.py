@@ -19,7 +19,7 @@ from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 from neurocal_cli import calibrate, calibrate_stereo, fit_stereo, read_points, triangulate
 from neurocal_cli.calibration.rig.assessment import assess_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
-from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.files.rig_yaml import read_stereo_rig
 from neurocal_cli.observations.points import Correspondences
 

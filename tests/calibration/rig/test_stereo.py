@@ -15,10 +15,9 @@ from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
 from neurocal_cli import StereoRig, calibrate
-from neurocal_cli.calibration.rig.adjust import adjust_rig
-from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
-from neurocal_cli.calibration.rig.combine import stereo_problem
-from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
+from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
@@ -78,7 +77,7 @@ def test_the_views_poses_go_through_the_rig() -> None:
 
 
 def test_the_common_fit_is_no_worse_than_any_rig_between_two_single_cameras() -> None:
-    from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+    from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
 
     points = sides(flat(), 0.3)
     apart = fit_stereo(*(calibrate(p, skew=False) for p in points))

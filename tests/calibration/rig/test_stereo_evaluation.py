@@ -10,7 +10,7 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.calibration.rig.triangulation import METHODS
 from neurocal_cli.camera.geometry import Array, rotation_step

@@ -7,7 +7,7 @@ import pytest
 from support.rigs import random_rig
 
 from neurocal_cli import Correspondences
-from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.frames import ViewPairs, pair_points, pair_views
 from neurocal_cli.errors import InputError
 
 

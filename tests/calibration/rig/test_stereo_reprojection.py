@@ -6,12 +6,10 @@ from support.rigs import RigScene, all_residuals, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
-from neurocal_cli.calibration.rig.adjust import adjust_rig
-from neurocal_cli.calibration.rig.combine import stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.consensus import find_consensus
-from neurocal_cli.calibration.rig.pairing import pair_views
-from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.state import RigState
+from neurocal_cli.calibration.rig.frames import pair_views
+from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.camera.geometry import Array
 
 

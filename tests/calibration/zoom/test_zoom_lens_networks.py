@@ -29,8 +29,13 @@ from neurocal_cli.calibration.zoom.parameter_networks import (
     outputs_to_local,
     to_scale,
 )
-from neurocal_cli.calibration.zoom.quadratic_error import with_scatter
-from neurocal_cli.calibration.zoom.settings import Constants, LensPoints, PixelData, scaled_controls
+from neurocal_cli.calibration.zoom.settings import (
+    Constants,
+    LensPoints,
+    PixelData,
+    scaled_controls,
+    with_scatter,
+)
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.observations.points import Correspondences
 

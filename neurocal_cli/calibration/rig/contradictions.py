@@ -1,0 +1,255 @@
+"""Frames that contradict each other: which views the rig leaves out, and what changed from some frame on.
+
+Large changes look different where one fit is a compromise between both parts. So the larger part is fitted
+without the smaller one, and this one by a rig of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.normal_equations import solve_scaled
+from neurocal_cli.adjustment.reprojection import squared_errors
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
+from neurocal_cli.calibration.rig.causes import (
+    LATE_CAMERA,
+    MOVED_CAMERA,
+    OTHER_SIZE,
+    TAKEN,
+    TWO_GEOMETRIES,
+    Named,
+    log_evidence,
+    named_cause,
+)
+from neurocal_cli.calibration.rig.consensus import UNSYNCHRONISED
+from neurocal_cli.calibration.rig.edges import MEDIAN, SUSPECT, described, pair_name
+from neurocal_cli.calibration.rig.frames import refuse_apart
+from neurocal_cli.calibration.rig.motion import timed
+from neurocal_cli.calibration.rig.problem import RigProblem
+from neurocal_cli.calibration.rig.refinement import adjusted
+from neurocal_cli.calibration.verdict.findings import LEVEL
+from neurocal_cli.camera.geometry import Array, median, rotation_vector
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import DegenerateGeometryError
+
+_TRIES = 2  # for the place and the kind of a change
+LeftOut = dict[tuple[int, str], str]  # views, by the index of the camera, and why
+
+
+def without_contradictions(
+    problem: RigProblem, start: Sequence[Pose], left_out: LeftOut, refine_cameras: bool, names: list[str]
+) -> tuple[RigFit, LeftOut, list[str]]:
+    """The common fit, the views that it leaves out, and its warnings."""
+    times = _times(problem)
+    told = [f"{name} camera" if name in ("left", "right") else f"camera {name}" for name in names]
+
+    def fitted() -> tuple[RigFit, list[str]]:
+        within = _detached(problem, left_out, names)
+        fit, warnings = adjusted(within, within.start(start), refine_cameras, told)
+        moving = with_delays(fit, times, names)
+        return (
+            (fit, warnings) if moving is fit else adjusted(moving.problem, moving.state, refine_cameras, told)
+        )
+
+    fit, warnings = fitted()
+    if suspects := _suspects(left_out):
+        # The others tell whether the suspects have a cause in common, or which of them fit after all.
+        still = at_fit(_detached(problem, _named(left_out), names), fit)
+        found = named_cause(still, names, free=of_rig(still))[0]
+        common = found is not None and is_common(found, still, fit, len(suspects))
+        if held := suspects if common else suspects & set(_views(problem, fitting(still))):
+            left_out = {view: why for view, why in left_out.items() if view not in held}
+            fit, warnings = fitted()
+    for _ in names:
+        found = named_cause(fit, names)[0]
+        if found is None or found.cause not in TWO_GEOMETRIES:
+            break
+        before = left_out
+        for _ in range(_TRIES):
+            why = f"{TAKEN} {'after' if found.is_late else 'before'} {found.text}"
+            left_out = before | dict.fromkeys(_views(problem, found.apart), why)
+            fit, warnings = fitted()
+            again = seen_again(_detached(problem, before, names), fit, found)
+            if again.text == found.text:
+                break
+            found = again
+    if left_out.keys() > (suspects := _suspects(left_out)):  # without the others, some may fit
+        still = at_fit(_detached(problem, _named(left_out), names), fit)
+        if held := suspects & set(_views(problem, fitting(still))):
+            left_out = {view: why for view, why in left_out.items() if view not in held}
+            fit, warnings = fitted()
+    return fit, left_out, warnings
+
+
+def with_delays(fit: RigFit, times: Sequence[Array] | None, names: Sequence[str]) -> RigFit:
+    """The fit with the motion of the target and the delays of the cameras, if the frames show them.
+
+    Delays are tried where they are the cause of the contradictions, stated times wherever they are known.
+    """
+    squares, degrees = scatter(fit)
+    if not is_significant(squares, degrees):
+        return fit
+    found, _ = named_cause(fit, names)
+    late = found is not None and found.cause is LATE_CAMERA
+    best, most = fit, LEVEL
+    for stated in ([times] if times is not None else []) + ([None] if late else []):
+        trial = timed(fit, stated)
+        if trial is not None:
+            evidence = log_evidence(squares, scatter(trial)[0], degrees, len(names) - 1)
+            if evidence > most:
+                best, most = trial, evidence
+    return best
+
+
+def _times(problem: RigProblem) -> list[Array] | None:
+    """Times of each camera's views, if all are known."""
+    times = [camera.points.view_times for camera in problem.calibrations]
+    known = [one for one in times if one is not None]
+    return known if len(known) == len(times) else None
+
+
+def _detached(problem: RigProblem, left_out: Mapping[tuple[int, str], str], names: list[str]) -> RigProblem:
+    """The problem without the views that are left out of the rig; each camera must still be in it."""
+    apart = [
+        np.array([(c, name) in left_out for name in own], dtype=bool) for c, own in enumerate(problem.names)
+    ]
+    found = problem.detached(apart)
+    member = np.zeros((len(names), len(found.scale)), dtype=int)
+    for row, observed in zip(member, found.observations, strict=True):
+        row[observed.view[found.together[observed.view]]] = 1
+    if not (member.sum(axis=1) > 0).all():
+        lost = names[int(np.argmin(member.sum(axis=1)))]
+        raise DegenerateGeometryError(
+            f"no view connects camera {lost}: {told_left_out(left_out, problem, names)}; check that the "
+            "views of a frame show one target at one moment, in the same order"
+        )
+    refuse_apart(names, member @ member.T > 0)
+    return found
+
+
+def told_left_out(left_out: Mapping[tuple[int, str], str], problem: RigProblem, names: Sequence[str]) -> str:
+    """The views that are left out, of two cameras by pairs, and why."""
+    if len(names) == 2:
+        pairs = {pair: left_out[0, pair[0]] for pair in problem.pairs if (0, pair[0]) in left_out}
+        faults = {pair_name(pair): why for pair, why in pairs.items()}
+        return described(faults, len(problem.paired), "pairs of views")
+    n = sum(int(problem.together[observed.view].sum()) for observed in problem.observations)
+    return described({f"{names[c]}/{view}": why for (c, view), why in left_out.items()}, n, "views")
+
+
+def _views(problem: RigProblem, chosen: Sequence[NDArray[np.bool_]]) -> list[tuple[int, str]]:
+    """The chosen views of each camera, (V_c,) bool, by the index of the camera and by name."""
+    return [
+        (c, view)
+        for c, (own, which) in enumerate(zip(problem.names, chosen, strict=True))
+        for view, is_in in zip(own, which, strict=True)
+        if is_in
+    ]
+
+
+def is_suspect(why: str) -> bool:
+    """Whether a view is only far from where the others see it, without a fault that has a name."""
+    return why == UNSYNCHRONISED
+
+
+def _suspects(left_out: Mapping[tuple[int, str], str]) -> set[tuple[int, str]]:
+    """The other ones."""
+    return {view for view, why in left_out.items() if is_suspect(why)}
+
+
+def _named(left_out: Mapping[tuple[int, str], str]) -> dict[tuple[int, str], str]:
+    """The views with a fault that has a name."""
+    return {view: why for view, why in left_out.items() if not is_suspect(why)}
+
+
+def at_fit(problem: RigProblem, fit: RigFit) -> RigFit:
+    """A problem at the cameras and the rig of a fit of some of its views, with the frames' poses refined."""
+    state = problem.start(
+        [Pose(R, t * problem.unit) for R, t in zip(fit.state.R[1:], fit.state.t[1:], strict=True)]
+    )
+    state = replace(state, cameras=fit.state.cameras)
+    return adjust_rig(problem, state, np.zeros(state.columns.n_shared, dtype=bool))
+
+
+def fitting(still: RigFit) -> list[NDArray[np.bool_]]:
+    """Which views of each camera, (V_c,), fit the rig after all, by the result of `at_fit`.
+
+    The linearised pose of a view of few points may seem far off, although the points fit the rig.
+    """
+    problem, state = still.problem, still.state
+    more, views = np.zeros(len(problem.scale)), np.zeros(len(problem.scale))
+    for side, observed in enumerate(problem.observations):
+        cost = observed.weight * squared_errors(observed.batches, problem.camera(state, side))
+        more[observed.view] += cost - problem.own_normal[side][:, -1, -1]
+        views[observed.view] += 1
+    apart = more / np.maximum(views - 1, 1)
+    limit = SUSPECT * max(1.0, float(median(apart[problem.together])) / MEDIAN)
+    return [apart[observed.view] < limit for observed in problem.observations]
+
+
+def is_common(found: Named, still: RigFit, fit: RigFit, n: int) -> bool:
+    """Whether a cause is more probable than n views that contradict the others, each for reasons of its own.
+
+    `fit` is without these views, and `still` has all at its cameras and rig (`at_fit`). The evidence of a
+    second geometry is that of the fits of both parts.
+    """
+    squares, degrees = scatter(still)
+    rest, evidence = scatter(fit)[0], found.evidence
+    if found.cause in TWO_GEOMETRIES:
+        own = scatter(_by_itself(still.problem, fit, found))[0]
+        choices = float(np.log(still.problem.together.sum() * len(still.problem.cameras)))
+        evidence = log_evidence(squares, rest + own, degrees, int(of_rig(still).sum())) - choices
+    return evidence > log_evidence(squares, rest, degrees, 6 * n)
+
+
+def seen_again(problem: RigProblem, fit: RigFit, found: Named) -> Named:
+    """The change as the fit of the larger part sees it; `problem` has the views of both parts."""
+    still, names = at_fit(problem, fit), found.cameras
+    again = named_cause(still, names, TWO_GEOMETRIES, np.zeros(len(still.free), dtype=bool))[0] or found
+    return again if len(names) > 2 else _moved_or_larger(problem, fit, again)
+
+
+def of_rig(fit: RigFit) -> NDArray[np.bool_]:
+    """(n_shared,) which shared unknowns are the poses of the cameras."""
+    free = np.zeros(len(fit.free), dtype=bool)
+    free[np.concatenate(fit.state.columns.rigs)] = True
+    return free
+
+
+def _by_itself(problem: RigProblem, fit: RigFit, found: Named) -> RigFit:
+    """The frames of the smaller part with a rig of their own and the cameras of the other part's fit."""
+    inside = np.zeros(len(problem.scale), dtype=bool)
+    for views, observed in zip(found.apart, problem.observations, strict=True):
+        inside[observed.view[views]] = True
+    part = problem.detached([~inside[observed.view] for observed in problem.observations])
+    start = at_fit(part, fit)
+    return adjust_rig(part, start.state, of_rig(start))
+
+
+def _moved_or_larger(problem: RigProblem, fit: RigFit, found: Named) -> Named:
+    """Of two cameras: whether the rig moved, or only their distance changed, as with another target.
+
+    The distance is one unknown of the six that a move has. It is preferred as long as the others gain less
+    than their share of the evidence.
+    """
+    own = _by_itself(problem, fit, found)
+    t, other = fit.state.t[1], own.state.t[1]
+    step = np.concatenate([rotation_vector(own.state.R[1] @ fit.state.R[1].T), other - t])
+    along = np.concatenate([np.zeros(3), t])
+    information = solve_scaled(_covariance(fit) + _covariance(own), np.eye(6))
+    scale = float(along @ information @ step / (along @ information @ along))
+    rest = step - scale * along
+    if not float(rest @ information @ rest) < 5 * np.log(max(scatter(at_fit(problem, fit))[1], 2)):
+        return replace(found, cause=MOVED_CAMERA, side=1)
+    longer = scale if found.is_late else 1 / (1 + scale) - 1
+    return replace(found, cause=OTHER_SIZE, side=-1, amounts=np.array([longer]))
+
+
+def _covariance(fit: RigFit) -> Array:
+    """(6, 6) covariance of the second camera's pose for given cameras, whose errors both parts share."""
+    found = fit.normal.only(np.flatnonzero(of_rig(fit))).covariance().shared
+    return np.asarray(max(fit.variance, 1.0) * found)

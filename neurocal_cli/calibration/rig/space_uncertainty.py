@@ -1,0 +1,225 @@
+"""What the uncertainty of a rig and its cameras means for points, depths and lengths in space.
+
+The pixels of a point X in the first camera's frame move by E dc with the unknowns c of the cameras and their
+poses, and by J dX with the point. So from the same pixels, an error dc shows the point X - N^-1 J^T E dc with
+N = J^T J, summed over the cameras that see it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.cross_validation import inverse_or_nan
+from neurocal_cli.adjustment.problem import intrinsic_matrix
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
+from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given
+from neurocal_cli.calibration.rig.frames import ViewPairs, pair_points
+from neurocal_cli.calibration.rig.motion import motion_of
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
+from neurocal_cli.calibration.rig.triangulation import triangulate
+from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.geometry import Array, cross_matrix
+from neurocal_cli.camera.measured import PlaneErrors, Spread
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import InputError
+
+_MOST_POINTS = 400  # most points that are triangulated
+
+
+def has_points(rig: Rig) -> bool:
+    """Whether a rig has the points that it was calibrated from."""
+    whole = all(set(camera.points.view_names) == set(camera.views) for camera in rig.cameras.values())
+    return whole and bool(rig.frames) and all(len(camera.points) for camera in rig.cameras.values())
+
+
+def fitted(rig: Rig) -> RigFit:
+    """The rig at its minimum, with the poses of its cameras and frames as unknowns."""
+    frame_of: dict[tuple[str, str], int] = {
+        (camera, view): k for k, views in enumerate(rig.frames.values()) for camera, view in views.items()
+    }
+    end, of_views = len(rig.frames), []
+    for name, camera in rig.cameras.items():
+        own = []
+        for view in camera.points.view_names:
+            frame = frame_of.get((name, view), -1)
+            if frame < 0:
+                frame, end = end, end + 1
+            own.append(frame)
+        of_views.append(np.array(own, dtype=np.intp))
+    problem = rig_problem(list(rig.cameras.values()), of_views)
+    state = problem.start(list(rig.poses.values())[1:])
+    if rig.delays:
+        motion = motion_of(problem, state, _times(rig)) or motion_of(problem, state, None)
+        if motion is not None:
+            delay = np.array([rig.delays.get(name, (0.0, 0.0))[0] for name in rig.cameras])
+            problem = replace(problem, motion=motion)
+            state = replace(state, delay=delay, timed=True)
+    return adjust_rig(problem, state, problem.estimated_shared)
+
+
+def _times(rig: Rig) -> list[Array] | None:
+    times = [camera.points.view_times for camera in rig.cameras.values()] if rig.timed else []
+    known = [one for one in times if one is not None]
+    return known if times and len(known) == len(times) else None
+
+
+def camera_in_pixels(fit: RigFit, side: int) -> Camera:
+    """A camera of the rig at its minimum."""
+    state = fit.state.cameras[side]
+    entries = fit.problem.observations[side].in_pixels(state.entries[0])
+    return Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), state.distortion)
+
+
+def in_camera(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
+    """Points (N, 3) of the first camera's frame in another one, and their derivatives by its pose."""
+    state, unit = fit.state, fit.problem.unit
+    turned = points @ state.R[side].T
+    shift = np.broadcast_to(unit * np.eye(3), (len(points), 3, 3))
+    return turned + unit * state.t[side], np.concatenate([-cross_matrix(turned), shift], axis=2)
+
+
+def point_moves(fit: RigFit, points: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """How points (N, 3) follow what the frames share, and their covariance by pixels of unit variance.
+
+    They are in the first camera's frame [world unit], and `seen` (C, N) tells which cameras see them. Returns
+    (N, 3, n_shared) and (N, 3, 3) arrays.
+    """
+    columns = fit.state.columns
+    normal = np.zeros((len(points), 3, 3))
+    right, axes = np.zeros((len(points), 3, columns.n_shared)), np.arange(3)
+    for side, rows in enumerate(map(np.flatnonzero, seen)):
+        own, by_pose = in_camera(fit, points[rows], side)
+        by_camera, by_point = camera_in_pixels(fit, side).project_jacobian(own)
+        by_camera[:, :, :5] *= fit.problem.observations[side].pixel_scale
+        if fit.state.cameras[side].square:
+            by_camera[:, :, 0] += by_camera[:, :, 2]
+        J = by_point @ fit.state.R[side]
+        Jt = np.swapaxes(J, 1, 2)
+        normal[rows] += Jt @ J
+        right[np.ix_(rows, axes, columns.cameras[side])] += Jt @ by_camera
+        if side:
+            right[np.ix_(rows, axes, columns.rigs[side])] += Jt @ by_point @ by_pose
+    by_pixel = inverse_or_nan(normal)
+    return -by_pixel @ right, by_pixel
+
+
+def shared_covariance(fit: RigFit) -> Array:
+    """(n_shared, n_shared) covariance of what the frames share: of the fit, and of given cameras."""
+    free = np.flatnonzero(fit.free)
+    shared = np.zeros((len(fit.free), len(fit.free)))
+    if is_significant(*scatter(fit)):
+        shared[np.ix_(free, free)] = contradicting_covariance(fit)
+    else:
+        shared[np.ix_(free, free)] = fit.variance * fit.normal.only(free).covariance().shared
+    given = covariance_by_given(fit.problem, fit.state, fit.normal, fit.free)
+    return shared if given is None else shared + given.shared
+
+
+def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
+    """Depths of points that two cameras see, in the first of them, and their std for exact pixels.
+
+    Both are (N,) in world units, of some points that are evenly spaced over the frames of both; nan for
+    points that are behind a camera, and empty without common points.
+    """
+    problem, state = fit.problem, fit.state
+    sides = problem.calibrations[first].points, problem.calibrations[second].points
+    seen = [problem.observations[side] for side in (first, second)]
+    of_second = {
+        frame: name
+        for name, frame in zip(problem.names[second], seen[1].view.tolist(), strict=True)
+        if problem.together[frame]
+    }
+    frames = zip(problem.names[first], seen[0].view.tolist(), strict=True)
+    pairs = tuple((name, of_second[frame]) for name, frame in frames if frame in of_second)
+    if not pairs:
+        return np.zeros(0), np.zeros(0)
+    try:
+        rows = pair_points(*sides, ViewPairs(pairs))
+    except InputError:  # views of different parts of the target
+        return np.zeros(0), np.zeros(0)
+    step = max(1, len(rows.left) // _MOST_POINTS)
+    pixels = sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
+    cameras = camera_in_pixels(fit, first), camera_in_pixels(fit, second)
+    R = state.R[second] @ state.R[first].T
+    pose = Pose(R, (state.t[second] - R @ state.t[first]) * problem.unit)
+    found = triangulate(*cameras, pose, *pixels)
+    kept = ~found.behind
+    points = (found.points[kept] - problem.unit * state.t[first]) @ state.R[first]
+    sees = np.isin(np.arange(len(problem.cameras)), (first, second))
+    moves, _ = point_moves(fit, points, np.repeat(sees[:, None], len(points), axis=1))
+    down = state.R[first][2] @ moves
+    if first:
+        down[:, state.columns.rigs[first]] += in_camera(fit, points, first)[1][:, 2]
+    depth, std = np.full(len(kept), np.nan), np.full(len(kept), np.nan)
+    depth[kept] = found.points[kept, 2]
+    variance = np.einsum("ni,ij,nj->n", down, shared_covariance(fit), down)
+    std[kept] = np.sqrt(np.maximum(variance, 0.0))
+    return depth, std
+
+
+def errors_at(rig: Rig | StereoRig, distance: float) -> PlaneErrors:
+    """Errors of points that are triangulated at a distance from the first camera; see `Rig.errors_at`."""
+    rig = of_two(rig) if isinstance(rig, StereoRig) else rig
+    if not (np.isfinite(distance) and distance > 0):
+        raise InputError(f"the distance must be a positive number, found {distance}")
+    if not has_points(rig):
+        raise InputError("the rig holds no points; give one that was not written with --lean")
+    first = rig.cameras[rig.first]
+    if first.image_size is None:
+        raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+    rays = first.camera.unproject(image_grid(first.image_size))
+    with np.errstate(invalid="ignore"):
+        rays = rays[rays[:, 2] > 0]  # nan too
+    points = distance * rays / rays[:, 2:]
+    seen = np.stack([_seen_by(rig, name, points) for name in rig.cameras])
+    seen[:, seen.sum(axis=0) < 2] = False
+    common = seen[0]
+    if common.sum() < 3:
+        raise InputError(
+            f"no other camera sees what {rig.first} sees at {distance:g} {rig.unit}; give another distance"
+        )
+    points, seen = points[common], seen[:, common]
+    fit = fitted(rig)
+    moves, by_pixel = point_moves(fit, points, seen)
+    covariance, variance = shared_covariance(fit), rig.rmse_px**2 / 2
+
+    def spread(gain: Array, noise: Array) -> Spread:
+        """Of some coordinates (k, n_shared) with their covariance (k, k) by pixels of unit variance."""
+        by_calibration = float(np.trace(gain @ covariance @ gain.T))
+        return Spread(*np.sqrt(np.maximum([by_calibration, variance * float(np.trace(noise))], 0.0)).tolist())
+
+    middle, ends = _places(points)
+    a, b = ends
+    length = float(np.linalg.norm(points[b] - points[a]))
+    along = (points[b] - points[a])[None] / length
+    of_length = spread(along @ (moves[b] - moves[a]), along @ (by_pixel[a] + by_pixel[b]) @ along.T)
+    of_points = [spread(move, noise) for move, noise in zip(moves, by_pixel, strict=True)]
+    of_depth = spread(moves[middle, 2:], by_pixel[middle, 2:, 2:])
+    worst = max(of_points, key=lambda one: one.std)
+    sigma = float(np.sqrt(variance))
+    return PlaneErrors(distance, sigma, length, of_length, of_points[middle], worst, of_depth)
+
+
+def _seen_by(rig: Rig, name: str, points: Array) -> NDArray[np.bool_]:
+    """(N,) whether a camera has points of the first camera's frame in its image."""
+    camera = rig.cameras[name].camera
+    pixels, seen = camera.project(rig.poses[name].to_camera(points))
+    if camera.image_size is None:
+        return np.asarray(seen)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(seen & ((pixels >= -1) & (pixels <= camera.image_size)).all(axis=1))
+
+
+def _places(points: Array) -> tuple[int, tuple[int, int]]:
+    """The point in the middle, and two that are half as far from each other as all are across."""
+
+    def nearest(place: Array) -> int:
+        return int(np.argmin(((points - place) ** 2).sum(axis=1)))
+
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    quarter = np.array([np.ptp(points[:, 0]) / 4, 0.0, 0.0])
+    return nearest(centre), (nearest(centre - quarter), nearest(centre + quarter))
