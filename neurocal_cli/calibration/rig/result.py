@@ -17,7 +17,6 @@ from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Sto
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice, not_smaller
-from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
@@ -26,31 +25,6 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.target import scale_of
 
 _SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
-
-
-def assemble_stereo(
-    fit: RigFit,
-    left_out: Mapping[tuple[str, str], str],
-    least: Array | None,
-    stretched: Array | None,
-) -> StereoRig:
-    """Convert the adjusted rig of two cameras to the user's units; see `RigAssembly`."""
-    found = RigAssembly(fit, least, stretched)
-    left, right = found.cameras
-    return StereoRig(
-        left,
-        right,
-        found.poses[0],
-        found.stds[0],
-        found.covariance,
-        tuple(fit.problem.pairs[k] for k in np.argsort(fit.problem.paired_left)),
-        dict(left_out),
-        rmse_px=found.rmse_px,
-        max_px=max(left.max_px, right.max_px),
-        converged=left.converged,
-        stop_reason=left.stop_reason,
-        iterations=fit.iterations,
-    )
 
 
 class RigAssembly:
