@@ -96,7 +96,7 @@ class StereoRig(FixedCameras):
     warnings: tuple[str, ...] = ()
     judgement: Verdict | Callable[[StereoRig], Verdict | None] | None = None
 
-    _summary = ("commands.show.stereo_report", "stereo_report")
+    _summary = ("commands.show.rig_report", "stereo_report")
 
     def __repr__(self) -> str:
         std = self.std.get("baseline", float("nan"))
