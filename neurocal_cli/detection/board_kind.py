@@ -38,6 +38,7 @@ _OUTER = 0.6  # least share of them in its outer lines
 _BORDER = 2.5  # squares between a grid with gaps and the image border
 _BESIDE = 1.5  # boards whose squares are smaller by more than this are behind the foremost one
 _ENOUGH = 0.2  # least share of the votes for the board's size, and greatest share of the grids that exceed it
+_CHANCE = 20  # vertices; smaller ones occur by chance in codes such as QR
 _CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
 _WITHIN = np.linspace(0.2, 0.8, 9)  # of a square, where its levels are looked at
 # Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
@@ -169,14 +170,18 @@ def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
 
 
 def _with_enough_votes(seen: Sequence[SeenBoard], least: Vote) -> dict[Size, int]:
-    """Sizes with enough votes of some kind, and their numbers; a single one must be sure or the only grid."""
+    """Sizes with enough votes of some kind, and their numbers.
+
+    A single vote must be sure or that of the only grid, and votes for small boards must be sure.
+    """
     votes = Counter(one.size for one in seen if one.vote >= least)
     sure = {one.size for one in seen if one.vote == Vote.SURE}
     alone = len(seen) == 1 and least == Vote.WHOLE
     return {
         size: count
         for size, count in votes.items()
-        if count >= _ENOUGH * votes.total() and (count > 1 or size in sure or alone)
+        if count >= _ENOUGH * votes.total()
+        and (size in sure or ((count > 1 or alone) and size[0] * size[1] >= _CHANCE))
     }
 
 

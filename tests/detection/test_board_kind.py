@@ -171,6 +171,17 @@ def test_squares_in_a_grid_are_no_circles() -> None:
         assert seen_circles(cv2.GaussianBlur(image, (0, 0), blur)) is None
 
 
+def test_squares_among_others_are_no_board() -> None:
+    rng = np.random.default_rng(3)
+    cells = (rng.random((24, 24)) < 0.5).astype(np.uint8)
+    cells[9:13, 9:14] = np.indices((4, 5)).sum(axis=0) % 2
+    image = cv2.resize(
+        255 * np.pad(cells, 3, constant_values=1), None, fx=9, fy=9, interpolation=cv2.INTER_NEAREST
+    )
+    with pytest.raises(NoBoardError):
+        found_board([cv2.GaussianBlur(image, (0, 0), 0.8)])
+
+
 def test_tags_without_squares_at_their_corners_are_named() -> None:
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     image = np.full((300, 380), 235, np.uint8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from support.marked import errors_of, marked_scene, plane_of, taken
@@ -83,7 +84,7 @@ def test_a_part_that_looks_the_same_after_a_turn_is_refused() -> None:
     assert isinstance(plane, CirclePlane)
     seen = plane.spread(plane.midpoint_grid()[plane.cols :]) * 30.0 + 50
     with pytest.raises(NoBoardError, match="which may be several parts of the board"):
-        place_circles(plane, Blobs(seen, np.full(len(seen), 300.0)))
+        place_circles(plane, Blobs(seen, np.full(len(seen), 300.0)), np.zeros((480, 640), np.uint8))
 
 
 def test_a_hidden_circle_is_left_out() -> None:
@@ -96,6 +97,34 @@ def test_a_hidden_circle_is_left_out() -> None:
     assert "1:3" not in found.ids
     assert len(error) >= 26
     assert np.abs(error).max() < 0.03
+
+
+def test_a_round_thing_beside_the_board_does_not_change_the_ids() -> None:
+    plane = plane_of(ASYMMETRIC)
+    assert isinstance(plane, CirclePlane)
+    grid = plane.midpoint_grid()
+    seen = plane.spread(grid[plane.cols :]) * 30.0 + 50
+    # Nearly at a place of a further row.
+    blobs = Blobs(np.concatenate([seen, [[86.0, 262.0]]]), np.full(len(seen) + 1, 300.0))
+    with pytest.raises(NoBoardError, match="which may be several parts of the board"):
+        place_circles(plane, blobs, np.zeros((480, 640), np.uint8))
+    # Beside a whole board it is left out.
+    whole = np.concatenate([plane.spread(grid) * 30.0 + 50, [[200.0, 262.0]]])
+    placed = place_circles(plane, Blobs(whole, np.full(len(whole), 300.0)), np.zeros((480, 640), np.uint8))
+    assert placed is not None
+    assert len(placed.place) == plane.cols * plane.rows
+
+
+@pytest.mark.parametrize(("width", "height", "gap"), [(14, 13, 0), (14, 10, 2), (8, 13, 2)])
+def test_windows_are_no_circles(width: int, height: int, gap: int) -> None:
+    image = np.full((300, 420), 190, np.uint8)
+    for row in range(6):
+        for column in range(7):
+            left, top = 40 + 50 * column, 30 + 44 * row
+            image[top : top + height + 1, left : left + width + 1] = 40
+            image[top : top + height + 1, left + width // 2 : left + width // 2 + gap] = 190
+    with pytest.raises(NoBoardError):
+        detect_points(cv2.GaussianBlur(image, (0, 0), 1.3), Board((plane_of("circles:7x6:20:12"),)))
 
 
 def test_another_number_of_circles_is_no_board() -> None:
@@ -120,7 +149,7 @@ def test_strong_perspective_does_not_change_which_circle_is_which() -> None:
     mapped = np.column_stack([world[:, :2], np.ones(len(world))]) @ H.T
     centre = mapped[:, :2] / mapped[:, 2:]
     blobs = Blobs(centre, 2e4 / mapped[:, 2] ** 3)
-    placed = place_circles(plane, blobs)
+    placed = place_circles(plane, blobs, np.zeros((480, 640), np.uint8))
     assert placed is not None
     names = {f"{c}:{r}": one for (c, r), one in zip(placed.place.tolist(), placed.centre, strict=True)}
     assert len(names) == 44
@@ -148,7 +177,7 @@ def test_errors_over_the_bound(form: str, square: float, condition: dict[str, fl
     assert isinstance(plane, CirclePlane)
     every, normal, bounds = [], [], []
     for seed in range(4):
-        scene = marked_scene(plane, seed, square=square, size=(640, 480), **condition)  # type: ignore[arg-type]
+        scene = marked_scene(plane, seed, square=square, size=np.zeros((480, 640), np.uint8), **condition)  # type: ignore[arg-type]
         picture = taken(scene, seed, 8)
         error, squared = errors(detect_points(picture.image, scene.board), picture)
         assert len(error) == picture.truth.planes[0].vertices_visible.sum()

@@ -4,11 +4,16 @@ The ellipses are the outlines of adaptive thresholds. The centres of both kinds 
 of an asymmetric one stand on their corners. From a start in the middle, neighbours are added where those
 before them predict them. The lattice then is compared with the board in all ways that keep its handedness.
 Perspective may make other vectors shorter than those of the rows, so the basis may be sheared.
+
+A round thing beside the board may look like one of its circles, and change which part of the board seems to
+be seen. So marks that are not where those around them predict them are left out, and one that is on no place
+of the board.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from itertools import product
 from typing import Any
 
@@ -18,6 +23,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.finding.saddles import Image, interpolate
+from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays, predicted
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
@@ -137,6 +144,9 @@ _SLANT = 0.35  # least sine of the angle between the steps at the start
 _STARTS = 30  # blobs that are tried as a start
 _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
+# Amplitudes of two and of four periods: at most 0.15 and 0.02 of circles of 6 px and more, blurred by up to
+# 3 px and tilted by up to 65 degrees, and of those moved by half of their radius.
+_LOPSIDED = 0.16, 0.03
 _SYMMETRIC = (
     "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
@@ -160,18 +170,31 @@ class PlacedCircles:
     light: bool = False  # whether they are light on dark
 
 
-def place_circles(plane: CirclePlane, blobs: Blobs) -> PlacedCircles | None:
-    """The largest lattice of ellipses, placed on the board; None if there is none that may be the board.
+def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> PlacedCircles | None:
+    """The largest lattice of dark ellipses in an image, placed on the board; None if there is none.
 
-    Raises NoBoardError if a part of the board is seen that may be several parts.
+    Raises NoBoardError if a part of the board is seen that may be several parts, or marks that are not round.
     """
     count = plane.cols * plane.rows
     best = largest_lattice(blobs, count)
-    if len(best) < max(min(_FEWEST, count), _LEAST_SHARE * count):
+    least = max(min(_FEWEST, count), _LEAST_SHARE * count)
+    if len(best) < least:
         return None
     at = np.array(list(best.values()), dtype=np.int64)
     index = np.array(list(best.keys()), dtype=np.int64)
-    return _placed(plane, blobs, index, at)
+    found, area = blobs.centre[at], blobs.area[at].astype(float)
+    size = grey.shape[1], grey.shape[0]
+    leave_out_strays(index.astype(float), found, area, flattening_of(index.astype(float), found, size))
+    kept = np.isfinite(area)
+    if kept.sum() < least:
+        return None
+    placed = _placed(plane, blobs, index[kept], at[kept])
+    places = plane.spread(placed.place.astype(float))
+    if lopsided(grey.astype(np.float32), places, placed.centre, placed.area, _LOPSIDED):
+        raise NoBoardError(
+            "the image shows marks in rows and columns that are not round, and no grid of circles"
+        )
+    return placed
 
 
 def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
@@ -281,24 +304,31 @@ def _placed(
 ) -> PlacedCircles:
     """Compare a lattice with the board in all bases and places."""
     board = _lattice_of(plane)
-    found: list[tuple[NDArray[np.int64], Array]] = []
+    found: list[NDArray[np.int64]] = []
+    but_one: list[int] = []
     for basis in BASES:
-        turned = index @ basis.T
-        found += [(turned + shift, basis) for shift in _shifts(turned, board)]
-    if not found:
+        for places, outside in _shifted(index @ basis.T, board):
+            if outside.any():
+                but_one.append(int(outside.argmax()))
+            else:
+                found.append(places)
+    if len(set(but_one)) == 1 and not found:
+        kept = np.arange(len(index)) != but_one[0]
+        return _placed(plane, blobs, index[kept], at[kept])
+    if not found and not but_one:
         size = index.max(axis=0) - index.min(axis=0) + 1
         raise NoBoardError(
             f"the image shows {len(index)} circles in {size[0]} x {size[1]} rows, no part of a board "
             f"of {plane.cols} x {plane.rows} circles; correct its description"
         )
-    names = [np.array([board[tuple(one)] for one in places.tolist()]) for places, _ in found]
+    names = [np.array([board[tuple(one)] for one in places.tolist()]) for places in found]
     if len(found) == 1:
         return PlacedCircles(names[0], blobs.centre[at], blobs.area[at])
     # Those of a board that looks the same after a turn contain the same places, turned about its middle.
     whole = len(index) == plane.cols * plane.rows
     turns = {tuple(map(tuple, np.unique(one, axis=0))) for one in names}
-    alike = len(turns) == 1 or _are_turns(plane, names)
-    if not whole and not (alike and _is_symmetric(plane)):
+    alike = len(turns) == 1 or (len(turns) > 1 and _are_turns(plane, names))
+    if not found or (not whole and not (alike and _is_symmetric(plane))):
         raise NoBoardError(
             f"the image shows {len(index)} circles, which may be several parts of the board; show all of it"
         )
@@ -315,18 +345,22 @@ def _lattice_of(plane: CirclePlane) -> dict[tuple[int, int], tuple[int, int]]:
     return {((x + y) // 2, (y - x) // 2): key for key, (x, y) in places.items()}
 
 
-def _shifts(
+def _shifted(
     index: NDArray[np.int64], board: dict[tuple[int, int], tuple[int, int]]
-) -> list[NDArray[np.int64]]:
-    """Shifts with which all places of a lattice are places of the board."""
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
+    """A lattice (N, 2) with all shifts that leave at most one place outside the board, and which (N,) is."""
     places = np.array(list(board), dtype=np.int64)
-    known = set(board)
-    first = index[0]
-    return [
-        place - first
-        for place in places
-        if all(tuple(one) in known for one in (index + (place - first)).tolist())
-    ]
+    low, high = places.min(axis=0), places.max(axis=0)
+    known = np.zeros(high - low + 1, dtype=bool)
+    known[tuple((places - low).T)] = True
+    # One of two places is on the board.
+    for shift in np.unique(np.concatenate([places - index[0], places - index[1]]), axis=0):
+        shifted = index + shift
+        inside = ((shifted >= low) & (shifted <= high)).all(axis=1)
+        if np.count_nonzero(inside) >= len(index) - 1:
+            inside[inside] = known[tuple((shifted[inside] - low).T)]
+            if np.count_nonzero(inside) >= len(index) - 1:
+                yield shifted, ~inside
 
 
 def _are_turns(plane: CirclePlane, names: list[NDArray[np.int64]]) -> bool:
@@ -350,3 +384,21 @@ def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
     known = np.column_stack([place, np.ones(len(place))])
     axis = np.linalg.lstsq(known, centre, rcond=None)[0][0]
     return float((axis[0] + 1e-3 * axis[1]) / np.hypot(*axis))
+
+
+def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tuple[float, float]) -> bool:
+    """Whether marks at places (N, 2) of a board are no circles, by the light where their areas (N,) end.
+
+    Of this light over their contrast, by the angle on the board, long marks have an amplitude of two periods,
+    and squares of four, larger than the `most` of either.
+    """
+    flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
+    steps = predicted(places, places, centre, flattening)[1]
+    radius = np.sqrt(area / (np.pi * np.maximum(np.abs(np.linalg.det(steps)), 1e-9)))
+    angle = 2 * np.pi * np.arange(16) / 16
+    ring = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    levels, inner, outer = (interpolate(light, centre[:, None] + s * ring @ steps) for s in (1.0, 0.3, 1.5))
+    contrast = np.abs(np.median(outer, axis=1) - np.median(inner, axis=1))
+    relative = (levels / np.maximum(contrast, 1.0)[:, None]).mean(axis=0)
+    amplitudes = (np.abs((relative * np.exp(1j * n * angle)).mean()) for n in (2, 4))
+    return any(one > limit for one, limit in zip(amplitudes, most, strict=True))

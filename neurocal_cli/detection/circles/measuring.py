@@ -353,8 +353,9 @@ def locate_circles(board: Board, image: NDArray[np.generic]) -> Identified:
     found: list[PlacedCircles] = []
     problems = []
     for light in (False, True):
+        dark = 255 - grey if light else grey
         try:
-            placed = place_circles(plane, find_blobs(255 - grey if light else grey))
+            placed = place_circles(plane, find_blobs(dark), dark)
         except NoBoardError as error:
             problems.append(str(error))
             continue

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice
-from neurocal_cli.detection.finding.saddles import interpolate
+from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice, lopsided
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.markers.reading import homographies, homography_at
 from neurocal_cli.detection.placement import NoBoardError
@@ -28,7 +27,7 @@ _LEAST_SHARE = 0.7  # of a pattern
 _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
 _BENT = 0.1  # greatest median of the second differences of centres, over the step
-_LOPSIDED = 0.06  # 0.02 of circles of 6 px
+_LOPSIDED = 0.06, 0.03  # 0.02 of circles of 6 px
 # Images that show the same full pattern without what is around it, and their least share.
 _AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
@@ -70,7 +69,7 @@ def seen_circles(image: NDArray[np.generic]) -> SeenCircles | None:
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    if _lopsided(grey.astype(np.float32), places, centre, area) > _LOPSIDED:
+    if lopsided(grey.astype(np.float32), places, centre, area, _LOPSIDED):
         return None
     full = share == 1
     return replace(seen, whole=full and _ends_seen(places, centre, seen, grey.shape), full=full)
@@ -109,28 +108,6 @@ def _bent(index: NDArray[np.int64], centre: Array) -> float:
                 step = np.hypot(*(centre[after] - centre[before])) / 2
                 bent.append(np.hypot(*(centre[before] + centre[after] - 2 * centre[k])) / max(step, 1e-9))
     return float(np.median(bent)) if bent else np.inf
-
-
-def _lopsided(light: NDArray[np.float32], places: Array, centre: Array, area: Array) -> float:
-    """How much the marks differ from circles: the light on the circle of their area, over their contrast.
-
-    Of the light by the angle on the board, it is the greatest amplitude of two or four periods, which long
-    marks and squares have.
-    """
-    H = homographies(places[None], centre[None])
-    step = 0.05
-    around = places[:, None] + step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    seen = homography_at(H, around.reshape(1, -1, 2)).reshape(-1, 4, 2)
-    steps = np.stack([seen[:, 0] - seen[:, 1], seen[:, 2] - seen[:, 3]], axis=1) / (2 * step)
-    radius = np.sqrt(area / (np.pi * np.maximum(np.abs(np.linalg.det(steps)), 1e-9)))
-    angle = 2 * np.pi * np.arange(16) / 16
-    ring = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    at = centre[:, None] + ring @ steps
-    levels = interpolate(light, at)
-    inner, outer = (interpolate(light, centre[:, None] + share * ring @ steps) for share in (0.3, 1.5))
-    contrast = np.abs(np.median(outer, axis=1) - np.median(inner, axis=1))
-    relative = (levels / np.maximum(contrast, 1.0)[:, None]).mean(axis=0)
-    return max(float(np.abs((relative * np.exp(1j * n * angle)).mean())) for n in (2, 4))
 
 
 def _ends_seen(places: Array, centre: Array, seen: SeenCircles, shape: tuple[int, ...]) -> bool:

@@ -114,15 +114,13 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     found = np.full(grid.shape, np.nan)
     contrast = np.full(grid.shape[:2], np.nan)
     corners, pixels = placed.ground.reshape(-1, 2), placed.marks.corners.reshape(-1, 2)
-    all_in_one = homography_at(homographies(corners[None], pixels[None]), corners[None])[0] - pixels
-    left = float(np.sqrt((all_in_one**2).sum(axis=1).mean()))
-    flattening = Flattening.of(corners, pixels, left, (image.shape[1], image.shape[0]))
+    flattening = flattening_of(corners, pixels, (image.shape[1], image.shape[0]))
     dark = int(placed.how.legacy)  # the cell at (c, r) is dark where c + r plus this is even
     count = 0
     while True:
         missing = np.isnan(contrast)
         at = np.argwhere(missing)
-        start, cell = _predicted(ground[missing], corners, pixels, flattening)
+        start, cell = predicted(ground[missing], corners, pixels, flattening)
         near = np.isfinite(start[:, 0])
         at, start, cell = at[near], start[near], cell[near]
         new, size = _refined(plane, image, grid[tuple(at.T)], start, cell, dark)
@@ -130,7 +128,7 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
         usual = float(np.nanmedian(every)) if np.isfinite(every).any() else np.inf
         good = size > _LEAST_CONTRAST * max(usual, 0.0)
         found[tuple(at[good].T)], contrast[tuple(at[good].T)] = new[good], size[good]
-        _leave_out_strays(ground, found, contrast, flattening)
+        leave_out_strays(ground, found, contrast, flattening)
         seen = np.isfinite(contrast)
         if seen.sum() < _FEWEST or seen.sum() <= count:
             break
@@ -149,6 +147,12 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     return Grid(np.ascontiguousarray(part), dark), first
 
 
+def flattening_of(ground: Array, pixels: Array, size: tuple[int, int]) -> Flattening:
+    """The map that flattens the image of a board with places (N, 2) at pixels."""
+    left = homography_at(homographies(ground[None], pixels[None]), ground[None])[0] - pixels
+    return Flattening.of(ground, pixels, float(np.sqrt((left**2).sum(axis=1).mean())), size)
+
+
 def corners_of_tags(plane: TagPlane, placed: Placed) -> tuple[Grid, tuple[int, int]]:
     """The corners of tags as they were read, as `find_vertices` gives those with squares at them."""
     found = np.full((plane.rows, plane.cols, 2), np.nan)
@@ -160,11 +164,14 @@ def corners_of_tags(plane: TagPlane, placed: Placed) -> tuple[Grid, tuple[int, i
     return Grid(np.ascontiguousarray(part), 0, paired=True), (int(low[0]), int(low[1]))
 
 
-def _leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: Flattening) -> None:
-    """Remove found vertices that are not where those around them predict, in place."""
+def leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: Flattening) -> None:
+    """Make places (..., 2) found at pixels (..., 2) that those around them predict elsewhere NaN, in place.
+
+    `contrast` (...,) is NaN for those that are not found.
+    """
     while (seen := np.isfinite(contrast)).sum() > _FEWEST_AROUND:
         places, pixels = ground[seen], found[seen]
-        start, cell = _predicted(places, places, pixels, flattening, itself=False)
+        start, cell = predicted(places, places, pixels, flattening, itself=False)
         off = np.hypot(*(pixels - start).T)
         side = np.sqrt(np.abs(np.linalg.det(cell)))
         near = np.abs(places[:, None] - places).max(axis=2) < _AROUND
@@ -175,7 +182,7 @@ def _leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: 
         found[tuple(at.T)], contrast[tuple(at.T)] = np.nan, np.nan
 
 
-def _predicted(
+def predicted(
     ground: Array, known: Array, pixels: Array, flattening: Flattening, itself: bool = True
 ) -> tuple[Array, Array]:
     """Pixels (N, 2) of places (N, 2) by homographies of the known places around each; NaN far from these.
