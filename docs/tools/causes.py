@@ -16,14 +16,14 @@ HEAD = "| cause | what the data look like | shared by | advice |\n| --- | --- | 
 def table() -> str:
     """One row for each cause, and for each of its looks."""
     sys.path[:0] = [str(ROOT)]
-    from neurocal_cli.calibration.verdict import patterns
+    from neurocal_cli.calibration.verdict import effects
     from neurocal_cli.calibration.verdict.rivals import RIVALS
 
     shared = {
-        patterns.common: "all views",
-        patterns.one_view: "one view",
-        patterns.changing: "all views in a pattern, or a group",
-        patterns.grouped: "a group of views",
+        effects.common: "all views",
+        effects.one_view: "one view",
+        effects.changing: "all views in a pattern, or a group",
+        effects.grouped: "a group of views",
         None: "no views: each has its own",
     }
     rows = dict.fromkeys(

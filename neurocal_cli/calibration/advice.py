@@ -5,7 +5,7 @@ C^T``. It needs no observed pixels, so views that were not taken can be compared
 weight, with the noise of the calibration.
 
 Changes of the camera that a motion of its frame compensates do not count, as in
-`verdict.projection_uncertainty`. There the frame moves with the poses of the views. Here it moves so that
+`verdict.measures`. There the frame moves with the poses of the views. Here it moves so that
 the pixels of near and far points all over the image move least, which does not depend on the views. So no
 view can make the camera less certain, and the numbers of both modules are similar but not equal.
 """
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.open_choices import open_at_points
 from neurocal_cli.calibration.calibration import Calibration, free_entries
-from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass

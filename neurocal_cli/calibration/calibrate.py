@@ -14,8 +14,7 @@ import numpy as np
 from neurocal_cli.adjustment.problem import Problem, problem_for
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, undistorted_before
-from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.lens_choice.skew import shows_skew
+from neurocal_cli.calibration.fit import fit, shows_skew
 from neurocal_cli.calibration.result import calibration_of, with_given_covariance
 from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
@@ -260,7 +259,7 @@ def calibrate(
 
 def _true_cause(points: Correspondences, type: int) -> str:
     """Why points are refused, if it is another cause than what the refusal says; else ""."""
-    from neurocal_cli.calibration.verdict.proportions import (
+    from neurocal_cli.calibration.verdict.what_is_given import (
         MEASURE_AXES,
         exchanged_rows,
         proportions,

@@ -94,7 +94,7 @@ class Verdict:
     word: str  # "good", "usable" or "poor"
     reasons: tuple[str, ...]  # what is wrong, the worst first; empty for a good calibration
     advice: tuple[str, ...]  # what to do about it
-    # The measures behind it (`calibration.verdict.evidence.Evidence`); nan if not determined.
+    # The measures behind it (`calibration.verdict.measures.Evidence`); nan if not determined.
     measures: Mapping[str, float]
 
 
@@ -212,7 +212,7 @@ class Calibration(Presented):
         InputError
             There is no such view, or the array has another shape.
         """
-        found: ProjectedPoints = late("calibration.point_projection", "project")(self, points, view)
+        found: ProjectedPoints = late("calibration.measurement", "project")(self, points, view)
         return found
 
     def on_plane(self, pixels: Array, view: str, sigma: float | None = None) -> PlanePoints:
@@ -237,7 +237,7 @@ class Calibration(Presented):
         InputError
             There is no such view, or its target has no point with Z = 0.
         """
-        found: PlanePoints = late("calibration.plane_measurement", "on_plane")(self, pixels, view, sigma)
+        found: PlanePoints = late("calibration.measurement", "on_plane")(self, pixels, view, sigma)
         return found
 
     def errors_at(self, distance: float) -> PlaneErrors:
@@ -246,7 +246,7 @@ class Calibration(Presented):
         The plane faces the camera, and its distance is taken as exact. Raises InputError for a distance that
         is not positive, and without image size.
         """
-        found: PlaneErrors = late("calibration.plane_measurement", "errors_at")(self, distance)
+        found: PlaneErrors = late("calibration.measurement", "errors_at")(self, distance)
         return found
 
     def position(self, view: str) -> CameraPosition:
@@ -254,7 +254,7 @@ class Calibration(Presented):
 
         Its covariance includes that of the camera. Raises InputError if there is no such view.
         """
-        found: CameraPosition = late("calibration.plane_measurement", "position")(self, view)
+        found: CameraPosition = late("calibration.measurement", "position")(self, view)
         return found
 
     def pose_of(self, view: str) -> Pose:

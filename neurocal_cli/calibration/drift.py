@@ -15,6 +15,8 @@ Covariances are estimates, from as many views as there are, so the statistics ha
 distributions. On photographs, standard deviations of pixels hold, but not those of the best known combination
 of all parameters: halves of real sets of photographs differ there by five standard deviations. Such
 combinations count as known no better than a third of what a pixel is.
+
+`fleet_sigmas` compares many cameras of one kind with each other.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration, spare_equations
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix, rotation_step
+from neurocal_cli.camera.geometry import Array, cross_matrix, median, rotation_step
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.observations.points import Correspondences
 
@@ -145,7 +147,7 @@ def drift_since(calibration: Calibration, points: Correspondences) -> Drift | No
 
 def _grid(old: Calibration | Camera, new: Calibration | Camera) -> Array:
     """Pixels over the image that both cameras have."""
-    from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+    from neurocal_cli.calibration.verdict.measures import image_grid
 
     sizes = {size for size in (camera_of(old).image_size, camera_of(new).image_size) if size is not None}
     if not sizes:
@@ -222,3 +224,37 @@ def tail(ratio: float, freedom: float, views: float) -> float:
     from scipy.special import betainc
 
     return float(betainc(views / 2, freedom / 2, views / (views + freedom * ratio)))
+
+
+FAR = 5.0
+"""Fleet sigmas from which on a camera is an outlier of the fleet."""
+
+_FEWEST = 5  # cameras that are a fleet
+_NORMAL = 1.4826  # standard deviation over the median absolute deviation of a normal distribution
+
+
+def fleet_sigmas(values: Array, std: Array) -> Array:
+    """Distances of cameras from the median of the fleet, in standard deviations.
+
+    Parameters
+    ----------
+    values, std : (N,) array
+        A parameter of each camera, nan if it is unknown, and its standard deviation.
+
+    Returns
+    -------
+    sigmas : (N,) array
+        The deviation is that of the fleet, which the median of the absolute deviations gives, and of the
+        camera itself. nan where the value is unknown, and if fewer than five are known.
+    """
+    known = np.isfinite(values)
+    sigmas = np.full(len(values), np.nan)
+    if np.count_nonzero(known) < _FEWEST:
+        return sigmas
+    own = values[known]
+    away = own - median(own)
+    spread = _NORMAL * float(median(np.abs(away)))
+    deviation = np.hypot(spread, np.nan_to_num(std[known]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigmas[known] = np.where(away == 0, 0.0, away / deviation)
+    return sigmas

@@ -7,11 +7,14 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import Solution, restarted
 from neurocal_cli.calibration.lens_choice.given_model import (
     DENOMINATOR,
@@ -34,6 +37,8 @@ from neurocal_cli.observations.points import Correspondences
 # local minimum).
 _FIRST_MODEL = "k1k2"
 _TILT_ROUNDS, _TILT_STEPS = 2, 60
+_SKEW = 1  # place of A12 among A's entries
+_LEVEL = 6.0  # log odds, as of any cause of errors
 
 
 @quietly  # starts that run into a pole of the distortion or into the camera's plane lose
@@ -185,8 +190,7 @@ def _displaced(solution: Solution) -> Solution:
 def _plumb_line_first(problem: Problem, options: Options) -> Solution:
     """Estimate the distortion from straight lines, then the pinhole camera, then both together."""
     # Imported here: it takes 0.01 s, which other models need not spend.
-    from neurocal_cli.calibration.lens_choice.plumb_line import fit_plumb_line
-    from neurocal_cli.calibration.lens_choice.plumb_line_camera import distortion_and_camera
+    from neurocal_cli.calibration.lens_choice.plumb_line import distortion_and_camera, fit_plumb_line
 
     points = problem.points
     plumb = fit_plumb_line(points, problem.given_centre)
@@ -203,3 +207,21 @@ def _turned(solution: Solution) -> Solution:
         return solution
     turned = try_mirrored(solution.problem, solution.adjusted)
     return solution if turned is solution.adjusted else replace(solution, adjusted=turned)
+
+
+def shows_skew(solution: Solution) -> bool:
+    """Whether theta, which the solution holds at 90 degrees, has evidence: log odds above six.
+
+    The log odds of one more unknown are n/2 log(c / c') - log(n)/2, for squared errors c and c' without and
+    with it, and n independent equations, fewer where neighbouring residuals are alike.
+    """
+    problem = solution.problem
+    free = problem.free.copy()
+    free[_SKEW] = True
+    skewed = replace(problem, free=free, fixed=problem.fixed - {"theta"})
+    cost, with_it = float(solution.adjusted.cost.sum()), float(skewed.adjust(solution.adjusted).cost.sum())
+    if not 0 < with_it < cost:
+        return False
+    alike = correlation(problem.views, point_residuals(problem.views, solution.state))
+    n = effective_number(max(problem.views.n_equations - skewed.n_parameters, 1.0), alike)
+    return bool(0.5 * n * np.log(cost / with_it) - 0.5 * np.log(n) > _LEVEL)

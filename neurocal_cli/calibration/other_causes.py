@@ -30,11 +30,10 @@ from neurocal_cli.calibration.lens_choice.model_selection import (
 )
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.effects import bends
+from neurocal_cli.calibration.verdict.effects import bends, common
 from neurocal_cli.calibration.verdict.findings import LEVEL, pixel_spread
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.noise import stated_noise
-from neurocal_cli.calibration.verdict.patterns import common
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates
 from neurocal_cli.calibration.verdict.rivals import RIVALS
 from neurocal_cli.camera.camera import Camera

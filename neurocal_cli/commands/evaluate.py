@@ -170,9 +170,8 @@ def camera(
     given = None if points is None else preparation.given_points(points)
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.drift import drift_since
-    from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.evaluation import evaluate_camera, judged_by_points
     from neurocal_cli.calibration.verdict.assessment import assess
-    from neurocal_cli.calibration.verdict.given_points import judged_by_points
     from neurocal_cli.commands.show.camera_report import (
         evaluation_json,
         evaluation_tables,

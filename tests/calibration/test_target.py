@@ -17,10 +17,10 @@ from support.targets import photographed_pair
 
 from neurocal_cli import Board, calibrate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
+from neurocal_cli.calibration.target_choice import on_one_target
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration

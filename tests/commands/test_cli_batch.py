@@ -20,7 +20,7 @@ from support.places import SAMPLES
 from support.sessions import camera, session
 
 from neurocal_cli import write_points
-from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
+from neurocal_cli.calibration.drift import FAR, fleet_sigmas
 from neurocal_cli.commands.batch_jobs import Job, Outcome
 from neurocal_cli.commands.batch_run import Pair, compare
 from neurocal_cli.commands.show.fleet import drift_text, fleet_page, fleet_rows, of_one_kind

@@ -17,9 +17,9 @@ from neurocal_cli import calibrate
 from neurocal_cli.adjustment.board.uncertainty import covariance_basis
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.common_target import _fit as fit_of
-from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.calibration.target_choice import _fit as fit_of
+from neurocal_cli.calibration.target_choice import on_one_target
 from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.commands.show.camera_report import calibration_report
 from neurocal_cli.detection.detect import detect_points

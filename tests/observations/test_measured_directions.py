@@ -18,7 +18,7 @@ from neurocal_cli.adjustment.common_noise import Noise, noise_of
 from neurocal_cli.adjustment.residual_correlation import correlation
 from neurocal_cli.adjustment.views import arrange, noise_model
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.lens_choice.collinear_points import find_lines
+from neurocal_cli.calibration.lens_choice.straight_lines import find_lines
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.camera.geometry import Array

@@ -27,7 +27,7 @@ HOMES = {
     "distributed": ("commands/cluster.py",),
     "dask": ("commands/cluster.py",),
     "cv2": (
-        "calibration/other_methods/opencv.py",
+        "calibration/other_methods/calibrate_by.py",
         "camera/remapping.py",
         "detection/",
         "files/board_pictures.py",

@@ -15,11 +15,11 @@ from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.arranged_boards import arranged
 from neurocal_cli.calibration.calibrate import CameraOptions, calibrate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.common_target import can_tell, common_target, on_one_target
 from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import ViewPairs, connected_frames
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.target_choice import can_tell, common_target, on_one_target
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.pinhole import Pose

@@ -19,20 +19,22 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
-from neurocal_cli.calibration.common_target import on_one_target
-from neurocal_cli.calibration.evaluation import other_images, predict, refuse_another_size
+from neurocal_cli.calibration.evaluation import (
+    GivenPoints,
+    given_camera,
+    given_error,
+    other_images,
+    predict,
+    refuse_another_size,
+    with_findings,
+)
 from neurocal_cli.calibration.rig.assessment import assess_stereo
 from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo, poses_on_rig
 from neurocal_cli.calibration.rig.frames import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.triangulation import Method, triangulate
+from neurocal_cli.calibration.target_choice import on_one_target
 from neurocal_cli.calibration.verdict.findings import Finding
-from neurocal_cli.calibration.verdict.given_points import (
-    GivenPoints,
-    given_camera,
-    given_error,
-    with_findings,
-)
 from neurocal_cli.calibration.verdict.odd_points import units_mixed
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median, rotation_vector

@@ -20,7 +20,7 @@ from neurocal_cli.calibration.rig.frames import ViewPairs, pair_points
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
 from neurocal_cli.calibration.rig.triangulation import triangulate
-from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.measured import PlaneErrors, Spread

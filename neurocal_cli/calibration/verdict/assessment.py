@@ -39,7 +39,6 @@ from neurocal_cli.calibration.calibration import (
     free_entries,
 )
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.evidence import Evidence, cover
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     EXACT,
@@ -49,17 +48,23 @@ from neurocal_cli.calibration.verdict.findings import (
     pixel_spread,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.given_parameters import hidden_by_lens, hidden_by_target
-from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
-from neurocal_cli.calibration.verdict.projection_uncertainty import (
+from neurocal_cli.calibration.verdict.measures import (
+    Evidence,
     ProjectionUncertainty,
+    cover,
     image_grid,
     pixel_covariance,
     projection_uncertainty,
 )
-from neurocal_cli.calibration.verdict.proportions import Proportions, proportions
+from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
+from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
 from neurocal_cli.calibration.verdict.rules import reach_verdict
+from neurocal_cli.calibration.verdict.what_is_given import (
+    Proportions,
+    hidden_by_lens,
+    hidden_by_target,
+    proportions,
+)
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion

@@ -6,7 +6,7 @@ views share it (`patterns`), and its words. Ten lines are usual.
 
 from __future__ import annotations
 
-from neurocal_cli.calibration.verdict import effects, patterns, words
+from neurocal_cli.calibration.verdict import effects, words
 from neurocal_cli.calibration.verdict.findings import DISPLACED, SHARE, Limit
 from neurocal_cli.calibration.verdict.rival import Rival
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
@@ -37,7 +37,7 @@ RIVALS: tuple[Rival, ...] = (
             "give --distortion auto, or a model with more coefficients",
             words.too_simple(model),
             _LENS,
-            patterns.common,
+            effects.common,
             steps=effects.lens(model),
         )
         for model in POLYNOMIAL_MODELS[1:]
@@ -48,7 +48,7 @@ RIVALS: tuple[Rival, ...] = (
         SAME,
         words.wrongly_given,
         GIVEN,
-        patterns.common,
+        effects.common,
         steps=effects.given,
         of_given=True,
     ),
@@ -58,7 +58,7 @@ RIVALS: tuple[Rival, ...] = (
         SAME,
         words.wrongly_given_lens,
         DISPLACED,
-        patterns.common,
+        effects.common,
         steps=effects.given_lens,
         of_given=True,
     ),
@@ -68,7 +68,7 @@ RIVALS: tuple[Rival, ...] = (
         _FIXED,
         words.changing("the focal length"),
         _CHANGED,
-        patterns.changing,
+        effects.changing,
         steps=effects.focal_length,
     ),
     Rival(
@@ -77,7 +77,7 @@ RIVALS: tuple[Rival, ...] = (
         _FIXED,
         words.changing("the size of the image"),
         _CHANGED,
-        patterns.changing,
+        effects.changing,
         steps=effects.image_size,
     ),
     Rival(
@@ -103,7 +103,7 @@ RIVALS: tuple[Rival, ...] = (
             _APART_ADVICE,
             words.two_cameras,
             SHARE,
-            patterns.grouped,
+            effects.grouped,
             steps=steps,
         )
         for steps in (effects.camera_and_lens, effects.centre)
@@ -114,7 +114,7 @@ RIVALS: tuple[Rival, ...] = (
         "give each view the points of the target that it shows",
         words.two_targets,
         _OFF,
-        patterns.grouped,
+        effects.grouped,
         effect=effects.stretch,
     ),
     Rival(
@@ -123,7 +123,7 @@ RIVALS: tuple[Rival, ...] = (
         "leave this view out, or give it as the camera has stored it",
         words.odd_view,
         DISPLACED,
-        patterns.one_view,
+        effects.one_view,
         steps=effects.camera,
     ),
     Rival(
@@ -132,7 +132,7 @@ RIVALS: tuple[Rival, ...] = (
         _FLAT,
         words.bent,
         _OFF,
-        patterns.common,
+        effects.common,
         effect=effects.bends,
         of_board=True,
     ),
@@ -142,7 +142,7 @@ RIVALS: tuple[Rival, ...] = (
         _FLAT,
         words.stretched,
         _OFF,
-        patterns.common,
+        effects.common,
         effect=effects.stretch,
         of_board=True,
     ),
@@ -161,7 +161,7 @@ RIVALS: tuple[Rival, ...] = (
         f"leave this view out, or {_STIFF}",
         words.bent_view,
         DISPLACED,
-        patterns.one_view,
+        effects.one_view,
         effect=effects.bends,
         of_board=True,
     ),
@@ -171,7 +171,7 @@ RIVALS: tuple[Rival, ...] = (
         "take the glass away",
         words.plain("the points are displaced by {px} px rms, as if seen through a plate of glass"),
         DISPLACED,
-        patterns.common,
+        effects.common,
         effect=effects.glass,
     ),
     *(
@@ -192,7 +192,7 @@ RIVALS: tuple[Rival, ...] = (
             _WHOLE,
             words.cut(*halves),
             DISPLACED,
-            patterns.common,
+            effects.common,
             effect=effects.cut(axis),
         )
         for axis, halves in enumerate((("left", "right"), ("upper", "lower")))
@@ -204,7 +204,7 @@ RIVALS: tuple[Rival, ...] = (
             "take single images, or a video of higher quality",
             words.plain(f"residuals of {{px}} px rms repeat in blocks of {side} px, as of a video codec"),
             DISPLACED,
-            patterns.common,
+            effects.common,
             effect=effects.blocks(side),
         )
         for side in _BLOCKS
@@ -223,7 +223,7 @@ RIVALS: tuple[Rival, ...] = (
     ),
 )
 """All rivals; those with the same name are alternatives of one cause."""
-SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is patterns.common)
+SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is effects.common)
 """Those by which the target has another shape in all views."""
 EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
 """All effects of the rivals."""

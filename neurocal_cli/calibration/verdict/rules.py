@@ -14,9 +14,8 @@ from neurocal_cli.calibration.calibration import (
     free_entries,
     spare_equations,
 )
-from neurocal_cli.calibration.verdict.causes import closest, explains
-from neurocal_cli.calibration.verdict.causes import findings as causes
-from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.calibration.verdict.contest import closest, explains
+from neurocal_cli.calibration.verdict.contest import findings as causes
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     CORRELATED,
@@ -37,8 +36,9 @@ from neurocal_cli.calibration.verdict.findings import (
     two_digits,
     verdict_of,
 )
+from neurocal_cli.calibration.verdict.measures import Evidence
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
-from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, unlike_axes
+from neurocal_cli.calibration.verdict.what_is_given import MEASURE_AXES, unlike_axes
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target

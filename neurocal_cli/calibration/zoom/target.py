@@ -24,7 +24,7 @@ from neurocal_cli.adjustment.board.posterior import prior_covariance
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.calibration.calibrate import Lens, calibrate
-from neurocal_cli.calibration.common_target import common_target
+from neurocal_cli.calibration.target_choice import common_target
 from neurocal_cli.calibration.zoom.settings import LensPoints, PixelData, Tables
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import NeurocalError

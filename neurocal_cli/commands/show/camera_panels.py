@@ -15,7 +15,7 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import CameraEvaluation, evaluate_camera
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
-from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.calibration.verdict.measures import Evidence
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

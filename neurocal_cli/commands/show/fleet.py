@@ -12,8 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from neurocal_cli.calibration.drift import SHARE
-from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
+from neurocal_cli.calibration.drift import FAR, SHARE, fleet_sigmas
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.batch_jobs import Job, Outcome
 from neurocal_cli.commands.show.html_page import figure, page, section

@@ -22,9 +22,13 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.adjustment.views import noise_model
-from neurocal_cli.calibration.lens_choice.collinear_points import FEWEST_ON_LINE, CollinearPoints, find_lines
 from neurocal_cli.calibration.lens_choice.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
-from neurocal_cli.calibration.lens_choice.straightness import distorted_lines
+from neurocal_cli.calibration.lens_choice.straight_lines import (
+    FEWEST_ON_LINE,
+    CollinearPoints,
+    distorted_lines,
+    find_lines,
+)
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics

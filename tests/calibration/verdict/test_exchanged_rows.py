@@ -10,7 +10,7 @@ from support.targets import photographed
 from support.wrong_inputs import CAUSES, FLAT, Input, flat
 
 from neurocal_cli import Correspondences, calibrate
-from neurocal_cli.calibration.verdict.proportions import exchanged_rows
+from neurocal_cli.calibration.verdict.what_is_given import exchanged_rows
 from neurocal_cli.errors import DegenerateGeometryError
 
 COLS, ROWS = 9, 7

@@ -15,7 +15,7 @@ from support.slow_cases import slow_but
 from support.wrong_inputs import CAMERA, board, flat, poses, seen
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, write_calibration
-from neurocal_cli.calibration.verdict.given_points import judged_by_points
+from neurocal_cli.calibration.evaluation import judged_by_points
 from neurocal_cli.files.points_csv import write_points
 
 

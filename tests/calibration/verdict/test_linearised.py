@@ -14,9 +14,9 @@ from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict import effects
+from neurocal_cli.calibration.verdict.effects import common
 from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen, linearised
-from neurocal_cli.calibration.verdict.patterns import common
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates, including
 from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS
 from neurocal_cli.camera.geometry import Array

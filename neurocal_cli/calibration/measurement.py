@@ -1,4 +1,4 @@
-"""Pixels to points on a plane, where a camera was, and what its uncertainty means for lengths.
+"""What a calibration measures: pixels of points, points on a plane, camera positions, with their uncertainty.
 
 A pixel moves by J dc with the camera's parameters c and by B dX with a point X of the plane. So a pixel that
 is measured with an error du shows the point X + B^-1 (du - J dc).
@@ -14,11 +14,28 @@ from neurocal_cli.calibration.verdict.assessment import (
     pixel_covariance_of,
     position_covariance_of,
 )
-from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
-from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, Spread
+from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, ProjectedPoints, Spread
 from neurocal_cli.errors import InputError
+
+
+def project(calibration: Calibration, points: Array, view: str | None = None) -> ProjectedPoints:
+    """Project points (N, 3); see `Calibration.project`."""
+    points = real_array("points", points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points must have the shape (N, 3), found {points.shape}")
+    if view is not None:
+        points = calibration.pose_of(view).to_camera(points)
+    pixels, seen = calibration.camera.project(points)
+    covariance = pixel_covariance_of(calibration, points[seen], view)
+    if covariance is not None:
+        everywhere = np.full((len(points), 2, 2), np.nan)
+        everywhere[seen] = covariance
+        covariance = everywhere
+    return ProjectedPoints(pixels, covariance, seen)
+
 
 _STEEPEST = np.cos(np.radians(75.0))  # of the rays of a wide lens that are judged
 _ON_PLANE = 1e-3  # largest |Z| of a point of the plane, as a share of the target's size

@@ -1,25 +1,36 @@
-"""Projection uncertainty: std of the pixel of a point in space due to noise in the calibration.
+"""The measures of a calibration from which its verdict follows: coverage and projection uncertainty.
 
-As in mrcal, a point is fixed to the targets of the calibration. The point at a pixel and a depth is
-transformed to the target by each view's pose, and back by the perturbed pose; the perturbed camera projects
-the mean of the results. So a change of the camera that a common change of its poses compensates counts as no
-uncertainty, just as it does not matter to a user.
+Projection uncertainty is the std of the pixel of a point in space due to noise in the calibration. As in
+mrcal, a point is fixed to the targets of the calibration. The point at a pixel and a depth is transformed to
+the target by each view's pose, and back by the perturbed pose; the perturbed camera projects the mean of the
+results. So a change of the camera that a common change of its poses compensates counts as no uncertainty,
+just as it does not matter to a user.
 
-To first order, the mean of the perturbed poses is a motion (omega, T) of the camera's frame,
-p -> p + omega x p + T, and everything follows from the normal matrices. Let S^-1 be the covariance of the
-shared parameters d, and B^-1 that of each view's pose given them. Then the motion is G d + e, where G is the
-mean of -M B^-1 C^T over the views and cov(e) that of M B^-1 M^T; M converts a view's pose step to a motion.
+To first order, the mean of the perturbed poses is a motion (omega, T) of the camera's frame, p -> p + omega x
+p + T, and everything follows from the normal matrices. Let S^-1 be the covariance of the shared parameters d,
+and B^-1 that of each view's pose given them. Then the motion is G d + e, where G is the mean of -M B^-1 C^T
+over the views and cov(e) that of M B^-1 M^T; M converts a view's pose step to a motion.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import Minimum, inverse_or_nan
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.calibration.verdict.findings import Finding
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
+from neurocal_cli.camera.state import CameraState
+from neurocal_cli.observations.points import Correspondences
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.verdict.contest import Contest
+    from neurocal_cli.calibration.verdict.what_is_given import Proportions
 
 _ACROSS = 21  # points across the image
 # The image circle of a wide lens is assumed to reach this times the angle of the farthest point, and at least
@@ -128,3 +139,80 @@ def _derivatives(m: Minimum, camera: Camera, points: Array) -> tuple[Array, Arra
     if m.state.square:
         by_camera[:, :, 0] += by_camera[:, :, 2]
     return by_camera[:, :, np.flatnonzero(m.free)], by_point
+
+
+_CELLS = 6  # across and down
+_THIRDS = (
+    ("upper left", "upper", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower", "lower right"),
+)
+
+
+@frozen_dataclass
+class Coverage:
+    """Coverage by the points of a calibration."""
+
+    image: float  # share of the image's 6 x 6 cells that hold a point; nan if the image size is unknown
+    empty: str  # the emptiest part of the image, such as "upper left"; "" if all parts are covered
+    tilt: float  # largest angle between two views' targets [degrees]; 90 for targets that are not flat
+    relief: float  # depth of the deepest target over its distance; nan if all are flat
+
+
+def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage:
+    """Coverage by the points of a calibration."""
+    tilt = 90.0
+    if views.nearly_flat.all():
+        normals = (state.R @ views.basis)[:, :, 2]
+        smallest = np.abs(normals @ normals.T).min()
+        tilt = float(np.degrees(np.arccos(np.clip(smallest, 0, 1))))
+    relief = _relief(points, views, state)
+    if points.image_size is None:
+        return Coverage(np.nan, "", tilt, relief)
+    size = np.array(points.image_size, dtype=float)
+    inside = ((points.pixels >= -0.5) & (points.pixels <= size - 0.5)).all(axis=1)
+    held = np.zeros((_CELLS, _CELLS))  # whether each cell of the image, row by row, holds a point
+    column, row = np.clip(((points.pixels[inside] + 0.5) / size * _CELLS).astype(int), 0, _CELLS - 1).T
+    held[row, column] = 1.0
+    thirds = held.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
+    v, u = np.unravel_index(int(np.argmin(thirds)), thirds.shape)
+    empty = _THIRDS[v][u] if thirds[v, u] < 0.5 else ""
+    return Coverage(float(held.mean()), empty, tilt, relief)
+
+
+def _relief(points: Correspondences, views: Views, state: CameraState) -> float:
+    solid = np.flatnonzero(~views.nearly_flat)
+    if not solid.size:
+        return np.nan
+    away = np.linalg.norm(state.t * views.scale[:, None], axis=1)  # of each view's centroid
+    along = [points.world[points.view_index == k] @ views.basis[k][:, 2] for k in solid]
+    return max(float(np.ptp(one)) / float(away[k]) for one, k in zip(along, solid, strict=True))
+
+
+@frozen_dataclass(eq=False)
+class Evidence:
+    """Measures of a calibration's quality; the last two are None if there is nothing of the kind."""
+
+    rmse_px: float  # rms reprojection error of the calibration
+    held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
+    # Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
+    # networks are no freer than the camera.
+    precision_px: float
+    contradiction: float  # rms error, corrected likewise, over `precision_px`; 1 for noise alone
+    # Chi-squared per parameter of the difference between two halves of the data; 1 if the reported standard
+    # deviations hold.
+    disagreement: float
+    correlation: float  # of neighbouring residuals; 0 for noise
+    condition: float  # of the normal matrix scaled to a unit diagonal
+    coverage: Coverage
+    # At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
+    # image size is unknown.
+    projection: ProjectionUncertainty | None
+    repeated: tuple[str, ...]  # views that are copies of others
+    mirrored: tuple[str, ...]  # views that show the target mirrored
+    of_given: tuple[Finding, ...]  # against a given centre that the lens or the target hides
+    noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
+    stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
+    poses: int  # number of different poses among the views (`repeated_poses`)
+    contest: Contest | None  # the causes of the residuals
+    proportions: Proportions | None  # of a board whose axes have different units
