@@ -113,6 +113,39 @@ def all_shifted(problem: RigProblem) -> str:
     return ""
 
 
+def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> tuple[int, int] | None:
+    """The last frame before two cameras have each other's images, and the next one; None if they never have.
+
+    `place` (V,) is that of each frame in their sequence. From some place on, the relative poses of both with
+    all cameras must be those that the other one had before. That must explain most pairs that contradict the
+    rig.
+    """
+    other = {a: b, b: a}
+    edges = [(a, b), *((one, c) for c in range(len(problem.cameras)) if c not in other for one in (a, b))]
+    agreed, n_pairs = np.zeros(len(place) + 1), np.zeros(len(place), dtype=int)
+    for c, d in edges:
+        as_named, after = problem.of_two(c, d), problem.of_two(other[c], other.get(d, d))
+        sides = (as_named, c), (after, other[c])
+        offers = [_poses(two).rigs() for two, _ in sides if len(two.paired)]
+        if not offers:
+            continue
+        R, t = (np.concatenate(part) for part in zip(*offers, strict=True))
+        fits = np.zeros((2, len(R), len(place) + 1))
+        for own, (two, first) in zip(fits, sides, strict=True):
+            frames = place[problem.observations[first].view[two.paired_left]]
+            own[:, 1 + frames] = _distance(two, _poses(two), R, t) < _EXCHANGED
+            n_pairs[frames] += two is as_named
+        # As named before each place, and exchanged from there on.
+        before, exchanged = fits.cumsum(axis=2)
+        agreed += (before + exchanged[:, -1:] - exchanged).max(axis=0)
+    at = int(np.argmax(agreed))
+    gain, odd = agreed[at] - agreed[-1], n_pairs.sum() - agreed[-1]
+    if gain < max(2 * LEAST_AGREED, AGREED * odd):
+        return None
+    seen = np.flatnonzero(n_pairs)
+    return int(seen[seen < at].max(initial=0)), int(seen[seen >= at].min(initial=len(place) - 1))
+
+
 def neighbours(pairs: Sequence[Pair], word: str) -> list[Pair]:
     """Each left view with the right view of the next, or of the previous, pair."""
     ordered = [pairs[k] for k in in_sequence(tuple(a for a, _ in pairs))]

@@ -12,6 +12,7 @@ their squared distance from it (Rousseeuw 1984).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,13 @@ from neurocal_cli.calibration.rig.consensus import (
     UNSYNCHRONISED,
     RigConsensus,
     all_shifted,
+    exchanged,
     find_consensus,
     with_shifted,
 )
 from neurocal_cli.calibration.rig.frames import groups
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.verdict.findings import name_some
+from neurocal_cli.calibration.verdict.findings import in_sequence, name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.pinhole import Pose
@@ -254,6 +256,31 @@ def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
         before, step = found[a], rigs[a, b]
         found[b] = Pose(step.R @ before.R, step.R @ before.t + step.t)
     return [found[k] for k in range(1, len(names))]
+
+
+def exchanged_cameras(edges: Sequence[Edge], problem: RigProblem, names: Sequence[str]) -> str:
+    """What is wrong where two cameras have each other's images from some frame on; "" if none have."""
+    odd = np.zeros(len(names), dtype=int)
+    for edge in edges:
+        odd[list(edge.cameras)] += len(edge.consensus.reasons) - edge.n_agreed
+    most = np.argsort(-odd, kind="stable")[:_PARTNERS]
+    suspects = sorted(most[odd[most] >= LEAST_AGREED].tolist())
+    if len(names) < 3 or len(suspects) < 2:
+        return ""
+    word: dict[int, str] = {}
+    for own, seen in zip(problem.names, problem.observations, strict=True):
+        for name, frame in zip(own, seen.view.tolist(), strict=True):
+            word.setdefault(frame, name)
+    order = in_sequence(tuple(word[k] for k in range(len(word))))
+    place = np.argsort(order)
+    for a, b in combinations(suspects, 2):
+        if (found := exchanged(problem, a, b, place)) is not None:
+            last, first = (word[order[k]] for k in found)
+            return (
+                f"the images of cameras {names[a]} and {names[b]} were exchanged between {last} and {first}; "
+                "exchange the names of these cameras in one of the two parts"
+            )
+    return ""
 
 
 def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list[int]]) -> str:

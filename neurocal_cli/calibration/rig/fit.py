@@ -29,6 +29,7 @@ from neurocal_cli.calibration.rig.edges import (
     Edge,
     connected,
     examined,
+    exchanged_cameras,
     views_left_out,
 )
 from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames
@@ -84,6 +85,8 @@ def fit_rig(
     cameras = dict(zip(names, with_agreeing_poses(list(cameras.values()), views), strict=True))
     problem = rig_problem(list(cameras.values()), views.of_views)
     edges = examined(problem, views.seen)
+    if told := exchanged_cameras(edges, problem, names):
+        raise DegenerateGeometryError(told)
     start = connected(edges, names)
     _refuse_poor_camera(edges, names)
     left_out = views_left_out(edges, problem)

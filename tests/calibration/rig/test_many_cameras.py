@@ -257,6 +257,27 @@ def test_a_camera_whose_images_are_shifted_by_one_is_named() -> None:
         calibrate_rig({**points, "cam3": replace(points["cam3"], view=names)}, skew=False)
 
 
+@pytest.mark.parametrize(
+    ("layout", "n", "frames", "seed", "a", "b", "at"),
+    slow_but(
+        (("line", 3, 16, 3, 0, 2, 8),),
+        [("line", 3, 16, 3, 0, 2, 8), ("line", 4, 30, 0, 1, 2, 15), ("star", 6, 40, 2, 1, 4, 10),
+         ("star", 5, 60, 11, 0, 3, 40), ("facing", 4, 60, 4, 1, 2, 30), ("line", 6, 40, 5, 2, 3, 20)],
+    ),
+)  # fmt: skip
+def test_cameras_that_have_each_others_images_from_some_frame_on_are_named(
+    layout: str, n: int, frames: int, seed: int, a: int, b: int, at: int
+) -> None:
+    _, points = scene(layout, n, frames, seed)
+    one, other = f"cam{a}", f"cam{b}"
+    first, second = points[one], points[other]
+    for name, before, after in ((one, first, second), (other, second, first)):
+        points[name] = joined(of_frames(before, lambda k: k < at), of_frames(after, lambda k: k >= at))
+    told = f"the images of cameras {one} and {other} were exchanged between {at - 1:03d} and {at:03d}"
+    with pytest.raises(NeurocalError, match=told):
+        calibrate_rig(points, skew=False, distortion="k1k2", target="given")
+
+
 def test_a_wrong_view_is_left_out_and_the_others_of_its_frame_are_kept() -> None:
     _, points = scene("line", 4, 20)
     wrong = points["cam2"]
