@@ -822,7 +822,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
         "holds several cameras of OpenSfM (a, b)",
     ),
     "Kinect": (KINECT, "convert that of one with --image-size: 1280 720"),
-    "p1 of a fisheye": (metashape("fisheye", "<p1>0.1</p1>"), "the coefficient p1 of Metashape's fisheye"),
+    "p1 of a fisheye": (
+        metashape("fisheye", "<p1>0.1</p1>"),
+        "the key 'p1' is not known in Metashape's fisheye",
+    ),
     "four of KWIVER": (
         "800 0 320\n0 801 240\n0 0 1\n1 0 0\n0 1 0\n0 0 1\n0 0 3\n1 2 3 4\n",
         "may be k1, k2, p1",

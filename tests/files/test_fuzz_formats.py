@@ -66,16 +66,19 @@ def read(files: dict[str, bytes], folder: Path) -> CameraSet:
     return read_cameras([folder / (name or "file") for name in files])
 
 
-def numbers(cameras: CameraSet) -> Array:
+def numbers(cameras: CameraSet, poses: bool = True) -> Array:
     """All that a file says, as numbers."""
     points = np.random.default_rng(1).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1.5], (30, 3))
     pixels = [camera.project(points)[0].ravel() for camera in cameras.cameras]
-    poses = [pose.D.ravel() for pose in (*cameras.relative, *cameras.poses.values())]
-    return np.nan_to_num(np.concatenate([*pixels, *poses]), nan=-1e9)
+    placed = [pose.D.ravel() for pose in (*cameras.relative, *cameras.poses.values()) if poses]
+    return np.nan_to_num(np.concatenate([*pixels, *placed]), nan=-1e9)
 
 
 READ = [name for name in FORMATS if name not in ("dlt", "lensfun")]
 TEXTS = [name for name in READ if name not in ("npz", "matlab", "neurocal")]
+KEY = re.compile(rb'(?m)(?<![\w./"<])["<]?([A-Za-z_][\w.]{0,60})["\']?\s*[:=>]')
+# The third radial coefficient may be missing, and a second camera matrix is told.
+MISSED = {"k3", "Camera.k3", "K_raw", "CamMatrixOriginal"}
 NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:[eE][-+]?\d+)?(?![\w.])")
 
 
@@ -125,12 +128,40 @@ def answered(files: dict[str, bytes], folder: Path) -> None:
     assert all(message.isprintable() and len(message) < 1500 for message in messages)
 
 
+def met() -> Iterator[tuple[str, dict[str, bytes]]]:
+    """Files that others write."""
+    for name, (content, *_) in [*MET.items(), *RIGS.items()]:
+        yield name, {"": (content if isinstance(content, str) else json.dumps(content, indent=1)).encode()}
+
+
+@pytest.mark.parametrize("share", slow_but((0.05,), (0.05, 1.0)))
+def test_no_renamed_key_of_a_camera_is_overlooked(share: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(45)
+    written = ((name, contents(name, one)) for name in TEXTS if name != "opencv" for _, one in sets(name))
+    for form, files in [*written, *met()]:
+        if b"CalibrationInformation" in files.get("", b""):
+            continue  # of any size
+        before = numbers(read(files, tmp_path / "f"), poses=False)
+        for name, data in files.items():
+            for key in sorted({match[1] for match in KEY.finditer(data)} - {one.encode() for one in MISSED}):
+                for new in (key + b"x", b"foo", b"my_" + key):
+                    if rng.random() > share:
+                        continue
+                    place = rb"(?<![\w.])" + re.escape(key) + rb"(?=[\"']?\s*[:=>])"
+                    changed = {**files, name: re.sub(place, new, data)}
+                    try:
+                        after = numbers(read(changed, tmp_path / "f"), poses=False)
+                    except NeurocalError:
+                        continue
+                    if len(after) == len(before):  # without its pose, a rig may be its first camera
+                        assert np.abs(after - before).max() < 1e-9, (form, key, new)
+
+
 @pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 1.0)))
 def test_damaged_files_of_all_formats_are_read_or_refused(share: float, tmp_path: Path) -> None:
     given = [contents(target, cameras) for target in READ for _, cameras in sets(target)]
     given += [{"": text.encode()} for text in DIALECTS]
-    kept = [*(content for content, *_ in MET.values()), *(content for content, *_ in RIGS.values())]
-    given += [{"": (one if isinstance(one, str) else json.dumps(one, indent=1)).encode()} for one in kept]
+    given += [files for _, files in met()]
     for trial in range(int(share * COUNT)):
         rng = np.random.default_rng([trial, 45])
         files = dict(given[int(rng.integers(len(given)))])

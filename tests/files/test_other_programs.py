@@ -475,7 +475,7 @@ FAULTS = {
     f'{{"K": {K}, "D": {D}, "lens_model": "FOV"}}': "its distortion model is not known here",
     f'{{"K1": {K}, "D1": {D}, "K2": {K}, "D2": {D}}}': "not their relative pose, R and T",
     f'{{"a": {{"K": {K}}}, "b": {{"K": {K}, "D": {D}}}}}': "holds several cameras (a, b)",
-    '{"fl_x": 800, "cx": 1, "cy": 1, "w": 2, "h": 2, "k4": 0.1}': "the coefficient k4 is not known",
+    '{"fl_x": 800, "cx": 1, "cy": 1, "w": 2, "h": 2, "k4": 0.1}': "the key 'k4' is not known",
     "camera calibration of tuesday\nfocal 800 801\ncentre 320 240\n": "is not a camera file",
     '<calibration created="x"><cameras/></calibration>': "is <calibration> and not OpenCV's",
     '{"CalibrationInformation": {"Cameras": []}}': "is the raw calibration of an Azure Kinect",

@@ -23,7 +23,8 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, find, numbers, transform, under
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, numbers, transform, under
+from neurocal_cli.files.exchange.camera_names import may_be_distortion
 from neurocal_cli.files.exchange.camera_set import (
     CameraSet,
     Format,
@@ -100,7 +101,15 @@ def _camera(field: Field, name: str) -> Camera:
             f"{name}: the camera model {model[:40]!r} is not known; calibrate it as pinhole-equi, "
             "pinhole-radtan, omni-radtan, ds-none or eucm-none, or with neurocal from the points"
         )
-    lens = field.get("distortion_model", "none").text()
+    lens = (
+        field["distortion_model"] if "distortion_coeffs" in field else field.get("distortion_model", "none")
+    ).text()
+    for key, value in field.value.items():
+        read = key in ("intrinsics", "distortion_coeffs", "distortion_model")
+        if not read and lens == "none" and may_be_distortion(key, value, guess=model == "pinhole"):
+            raise InputError(
+                f"{name}: {key[:40]!r} may be the distortion; name it distortion_coeffs, or remove it"
+            )
     if (model, lens) not in _MODELS:
         raise InputError(
             f"{name}: the distortion model {lens[:40]!r} is not known with the camera model {model}; "
@@ -175,6 +184,7 @@ _BOOFCV = CameraKeys(
     model="model",
     size=("pinhole/width", "pinhole/height"),
     skew="pinhole/skew",
+    optional="any",
 )
 
 
@@ -188,12 +198,6 @@ def _boofcv_camera(root: Field, name: str = "camera") -> Camera:
         )
     if "skew" not in root["pinhole"]:
         root["pinhole"]["skew"].number()
-    radial = find(root, f"{_R}radial")
-    if radial is not None and (k := radial.array(-1)).size > 2:
-        if k.size > 3:
-            radial.fail("3 numbers at most")
-        if omni and k[2]:
-            raise InputError("a third radial coefficient of an omnidirectional camera is not known; use two")
     return _BOOFCV.camera(root, name)
 
 
@@ -259,6 +263,9 @@ _CALIB_IO = CameraKeys(
     (Lens(("libCalib::CameraModelOpenCV",), "tilted", tuple(f"{name}/val" for name in MODELS["tilted"])),),
     model="model",
     size=("imageSize/width", "imageSize/height"),
+    optional="any",
+    complete=True,
+    aside=("ar", "f"),
 )
 
 

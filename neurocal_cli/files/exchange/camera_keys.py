@@ -23,13 +23,13 @@ from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
-from neurocal_cli.files.exchange.camera_names import matrix_of
+from neurocal_cli.files.exchange.camera_names import matrix_of, may_be_distortion
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import flow, number, text
 
-_COEFFICIENT = re.compile(r"(?:.*\.)?([kps]\d)$").match
+NOTHING = "-"  # the place of a coefficient that a program does not have
 _POLYNOMIAL = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted")
 
 
@@ -56,6 +56,9 @@ class CameraKeys:
     skew: str = ""
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
     constants: Mapping[str, Any] = field(default_factory=dict)  # written as they are
+    optional: str = ""  # which coefficients a file may lack: all at once, or any
+    aside: tuple[str, ...] = ()  # other numbers beside those of the camera
+    complete: bool = False  # whether there are no others
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -97,7 +100,11 @@ class CameraKeys:
     def _lens(self, root: Field) -> Lens:
         stated = find(root, self.model) if self.model else None
         if stated is None:
-            return self._last(self.lenses[0])
+            first = self._last(self.lenses[0])
+            others = [one for one in self.lenses if one.ours != first.ours and one.places == first.places]
+            if self.model and others and first.places:
+                at(root, self.model)  # the same numbers may be those of either
+            return first
         word = _plain(stated.text())
         for lens in self.lenses:
             if word in map(_plain, lens.words):
@@ -114,21 +121,26 @@ class CameraKeys:
 
     def _distortion(self, root: Field, lens: Lens) -> Distortion:
         count = len(MODELS[lens.ours])
+        whole = not self.optional or lens.ours not in (*_POLYNOMIAL, "fisheye")
+        lacking = False
         if count and len(lens.places) == 1 < count:
-            found = find(root, lens.places[0])
+            found = at(root, lens.places[0]) if whole else find(root, lens.places[0])
             values = np.zeros(0) if found is None else numbers(found)
-            fewest = 0 if lens.ours in _POLYNOMIAL else count
-            if found is not None and not fewest <= len(values):
-                found.fail(f"{count} numbers")
-            if found is None and fewest:
-                at(root, lens.places[0])
         else:
-            whole = lens.ours not in (*_POLYNOMIAL, "fisheye")
-            fields = [at(root, path) if whole else find(root, path) for path in lens.places]
-            if fields and fields[0] is None and any(entry is not None and entry.value for entry in fields):
-                at(root, lens.places[0])  # later coefficients alone are no distortion
-            values = np.array([0.0 if entry is None else entry.number() for entry in fields])
-            self._refuse_others(root, lens)
+            fields = {path: find(root, path) for path in lens.places if path != NOTHING}
+            stated = any(fields.values())
+            needed = lens.places if whole else ()
+            if stated and not whole:  # later coefficients alone are no distortion
+                fewest = next(one for one in self.lenses if one.words == lens.words).places
+                needed = fewest if self.optional == "all" else lens.places[:1]
+            for path in needed:
+                if path != NOTHING:
+                    at(root, path)
+            lacking = stated and not all(fields.values())
+            values = np.array(
+                [0.0 if (one := fields.get(path)) is None else one.number() for path in lens.places]
+            )
+        self._refuse_others(root, lens, self.complete or lacking)
         if lens.ours in _POLYNOMIAL:
             return Distortion(*from_ros("plumb_bob", np.pad(values, (0, max(0, 5 - len(values))))))
         if len(values) != count:
@@ -137,18 +149,36 @@ class CameraKeys:
             )
         return Distortion(lens.ours, values)
 
-    def _refuse_others(self, root: Field, lens: Lens) -> None:
-        """Refuse a coefficient beside those of the lens."""
-        for folder in dict.fromkeys(place.rpartition("/")[0] for place in lens.places):
-            parent = root if not folder else find(root, folder)
-            known = {place.rpartition("/")[2] for place in (*lens.places, *lens.intrinsics)}
-            stem = {place.rpartition(".")[0] for place in known}
-            for key, value in (parent.value if parent and isinstance(parent.value, dict) else {}).items():
-                alike = _COEFFICIENT(key) and key.rpartition(".")[0] in stem and key not in known
-                if alike and isinstance(value, (int, float)) and value:
+    def _refuse_others(self, root: Field, lens: Lens, every: bool) -> None:
+        """Refuse what may be a coefficient or the name of another lens, and was not read.
+
+        If `every`, because a coefficient is missing, each number may be it.
+        """
+        paths = [*self.intrinsics, *lens.intrinsics, *lens.places, *self.size, *self.constants]
+        paths = [path.partition(":")[0] for path in (*paths, self.model, self.name, self.skew) if path]
+        others = [one for one in self.lenses if one.ours not in (lens.ours, "none")]
+        words = {_plain(word) for one in others for word in one.words if len(word) > 2}
+        for folder in dict.fromkeys(["", *(path.rpartition("/")[0] for path in paths)]):
+            parent = find(root, folder) if folder else root
+            start = f"{folder}/" if folder else ""
+            known = {path.removeprefix(start).partition("/")[0] for path in paths if path.startswith(start)}
+            stems = {key.rpartition(".")[0] for key in known}
+            value, listed = None if parent is None else parent.value, False
+            if isinstance(value, list) and any(place.startswith(start) for place in lens.places):
+                value, listed = {str(k): entry for k, entry in enumerate(value)}, True
+            for key, entry in value.items() if isinstance(value, dict) else ():
+                stem, _, last = key.rpartition(".")
+                if key in known or stem not in stems or last in self.aside:
+                    continue
+                if isinstance(entry, dict) and "val" in entry:
+                    entry = entry["val"]
+                named = isinstance(entry, str) and _plain(entry) in words
+                if named or may_be_distortion(f"k{key}" if listed else last, entry, False, every):
+                    what = f"coefficient {folder}[{key}]" if listed else f"key {key[:60]!r}"
                     raise InputError(
-                        f"the coefficient {key} is not known in {self.program}'s model {lens.words[0]}; "
-                        "calibrate it without, or with neurocal from the points"
+                        f"the {what} is not known in {self.program}'s {lens.words[0] or 'cameras'}, and may "
+                        "tell their distortion; correct its name, remove it, or calibrate with neurocal from "
+                        "the points"
                     )
 
     def tree(self, camera: Camera) -> dict[str, Any]:

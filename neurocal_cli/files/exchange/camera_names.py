@@ -94,16 +94,21 @@ _WORDS = (
 ALIKE = ("plumb_bob", "rational_polynomial", "thin_prism", "tilted", "pinhole")
 
 # Names of numbers that may be a distortion, and of some that are none.
-SUSPECT = re.compile(r"dist(?!an|rib)|^kc|coef|radial|tangent")
-SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")  # of the plain name, whole
-SUSPECT_WORD = re.compile(r"(?:^|[\W_])[kp]_?[1-6](?:[\W_]|$)", re.IGNORECASE)  # of the name as it is
+_SUSPECT = re.compile(r"dist(?!an|rib)|^kc|coef|radial|tangent")
+_SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")  # of the plain name, whole
+_SUSPECT_WORD = re.compile(  # of the name as it is
+    r"(?:^|[\W_])[kp]{1,2}_?[1-6][a-z]?(?:[\W_]|$)|^(?:alpha|beta)$", re.IGNORECASE
+)
 HARMLESS = re.compile(
     r"std|err|undist|newcam|uncert|sigma|limit|rms|perview|roi|optimal|thresh|flag|aspect|fix|rect|^est|valid"
+    r"|prior"
 )
-NO_LIST = re.compile(
+_NO_LIST = re.compile(
     r"roi|quat|rot|^q\d?$|rect|crop|box|board|pattern|size|color|time|pose|trans|orient|^[rtp]\d?$"
 )
-LENGTHS = (4, 5, 8, 12, 14)
+_LENGTHS = (4, 5, 8, 12, 14)
+_MOST_OF_ONE = 6  # coefficients of one kind
+_LONG = 40  # characters of a text that may hold packed numbers
 
 
 def plain(name: str) -> str:
@@ -196,3 +201,29 @@ def flat(value: Any) -> list[float]:
     if isinstance(value, (list, tuple)):
         return [number for entry in value for number in flat(entry)]
     return [float(value)] if is_numbers(value) else [float("nan")]
+
+
+def may_be_distortion(key: str, value: Any, guess: bool, every: bool = False) -> bool:
+    """Whether a value that was not read may be the distortion, by its name and its numbers.
+
+    If `guess`, a list of as many numbers as there are coefficients has any name; if `every`, each number has.
+    """
+    name = plain(key)
+    if HARMLESS.search(name):
+        return False
+    if isinstance(value, str) and not is_numbers(value):
+        numbers, value = [1.0] * (len(value) >= _LONG and " " not in value), []
+    elif isinstance(value, dict) and not is_numbers(value):
+        numbers = [n for entry in value.values() if is_numbers(entry) for n in flat(entry)]
+    elif is_numbers(value):
+        numbers = flat(value)
+    else:
+        return False
+    if isinstance(value, (list, dict)):
+        listed = guess and len(numbers) in _LENGTHS and not _NO_LIST.search(name)
+        suspect = _SUSPECT.search(name) is not None or (listed and any(n != int(n) for n in numbers))
+        suspect = suspect or (name in ("k", "p") and len(numbers) <= _MOST_OF_ONE)
+    else:
+        word = _SUSPECT_WORD.search(key) is not None or every
+        suspect = _SUSPECT_NUMBER.fullmatch(name) is not None or (word and numbers[0] % 1 != 0)
+    return suspect and any(numbers)

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
@@ -64,6 +65,8 @@ def _read_anipose(document: Document) -> CameraSet:
             document.notes.append(f"{document.source}: {key} is to be ignored, and is left out")
             continue
         fisheye = part.get("fisheye", False).boolean()
+        if "fisheye" not in part and len(part["distortions"].array(-1)) == len(MODELS["fisheye"]):
+            part.refuse(f"{key} has four coefficients; say fisheye = true, or false, for it")
         keys = _ANIPOSE_FISHEYE if fisheye else _ANIPOSE
         cameras.append(keys.camera(part, f"cam_{key}" if key.isdecimal() else key))
         pose = None

@@ -33,18 +33,13 @@ from neurocal_cli.files.exchange.camera_names import (
     HARMLESS,
     HEIGHT,
     KIND,
-    LENGTHS,
     MATRIX,
     MODEL,
     NAME,
-    NO_LIST,
     ORIGINAL,
     RADIAL,
     SHAPE,
     SIZE,
-    SUSPECT,
-    SUSPECT_NUMBER,
-    SUSPECT_WORD,
     TANGENTIAL,
     UNKNOWN,
     WIDTH,
@@ -54,6 +49,7 @@ from neurocal_cli.files.exchange.camera_names import (
     is_matrix,
     is_numbers,
     matrix_of,
+    may_be_distortion,
     means,
     parameters_apart,
     plain,
@@ -63,7 +59,6 @@ from neurocal_cli.files.tree_fields import Field
 
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
 _LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
-_LONG = 40  # characters
 
 
 class LooseKeys:
@@ -172,25 +167,8 @@ class LooseKeys:
     def refuse_unread(self, every: bool = False) -> None:
         """Refuse numbers that may be the distortion and were not read; `every` number of a mapping of it."""
         for key, value in self.root.value.items():
-            name = plain(str(key))
-            if key in self.read or HARMLESS.search(name):
-                continue
-            if isinstance(value, str) and not is_numbers(value):  # a long text may hold packed numbers
-                numbers, value = [1.0] * (len(value) >= _LONG and " " not in value), []
-            elif isinstance(value, dict) and not is_numbers(value):
-                numbers = [n for entry in value.values() if is_numbers(entry) for n in flat(entry)]
-            elif is_numbers(value):
-                numbers = flat(value)
-            else:
-                continue
-            if isinstance(value, (list, dict)):
-                listed = len(numbers) in LENGTHS and not NO_LIST.search(name)
-                guess = not self.coefficients_read and listed and any(n != int(n) for n in numbers)
-                suspect = guess or SUSPECT.search(name) is not None
-            else:
-                word = SUSPECT_WORD.search(str(key)) is not None or every
-                suspect = SUSPECT_NUMBER.fullmatch(name) is not None or (word and numbers[0] % 1 != 0)
-            if suspect and any(numbers):
+            guess = not self.coefficients_read
+            if key not in self.read and may_be_distortion(str(key), value, guess, every or self.lacks):
                 raise InputError(
                     f"the key {str(key)[:60]!r} may be the distortion, and is not a known name of it; rename "
                     "it to distortion_coefficients, or remove it"
@@ -211,6 +189,7 @@ class LooseKeys:
         return self._coefficients(side)[0] is not None
 
     coefficients_read = False
+    lacks = False  # one of k1, k2, p1, p2, and not all of them
 
     def _intrinsics(self, side: str) -> Intrinsics:
         field = self.find(ORIGINAL, side, is_matrix)
@@ -265,6 +244,9 @@ class LooseKeys:
             four = [*(2 * flat(focal.value))[:2], *own]
             size = self.image_size()
             ratio = self.find(ASPECT, "", is_numbers)
+            if ratio is None:
+                likely = [name for name in self.names if "aspect" in name or "ratio" in name]
+                ratio = self.find(likely, "", lambda v: isinstance(v, (int, float)))
             if len(flat(focal.value)) == 1 and ratio is not None and ratio.number() not in (0, 1):
                 raise InputError(
                     f"has one focal length and {ratio.path}, which programs take as fy / fx or fx / fy; give "
@@ -316,6 +298,10 @@ class LooseKeys:
         model = self._stated_model(side)
         if model in ("double_sphere", "eucm") and coefficients is None:
             found = [self.find((name,), side, is_numbers) for name in MODELS[model]]
+            if any(found) and not all(found):
+                raise InputError(
+                    f"has not all of {', '.join(MODELS[model])}, the coefficients of {model}; add them"
+                )
             if all(found):
                 return Distortion(model, np.array([entry.number() for entry in found if entry]))
         if coefficients is None:
@@ -358,17 +344,21 @@ class LooseKeys:
                 return found
             return matrix_data(field, -1), False
         radial, tangential = (self.find(names, side, is_numbers) for names in (RADIAL, TANGENTIAL))
-        if radial is None and not side:  # mmpose and VoxelPose
+        if radial is tangential is None and not side:  # mmpose and VoxelPose
             radial, tangential = (
                 self.find((name,), "", counts)
                 for name, counts in (("k", lambda v: _count(v) in (2, 3, 6)), ("p", lambda v: _count(v) == 2))
             )
+        if radial is None and tangential is not None and any(flat(tangential.value)):
+            tangential.refuse(f"has {tangential.path}, and no radial coefficients under a known name")
         if radial is not None:
             k = (
                 matrix_data(radial, -1)
                 if not isinstance(radial.value, (int, float))
                 else np.array([radial.number()])
             )
+            if tangential is None and radial.path.rpartition(".")[2] in ("k", "K"):
+                radial.refuse("has k and no p; add p, the two tangential coefficients, or zeros")
             p = np.zeros(2) if tangential is None else matrix_data(tangential, 2)
             if len(k) not in (1, 2, 3, 6):
                 radial.fail("2, 3 or 6 numbers")
@@ -381,6 +371,7 @@ class LooseKeys:
                 values[name] = entry.number()
         if not values:
             return None, False
+        self.lacks = len({*names[:4], *values} - set(values)) > 0
         if "k4" in values and not {"p1", "p2", "k5", "k6"} & set(values):  # as in a fisheye
             return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
         full = [values.get(name, 0.0) for name in names]

@@ -116,7 +116,7 @@ def _camera(tree: dict[str, Any]) -> Camera:
         K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
     radial = _numbers(tree, "RadialDistortion")
-    tangential = _numbers(tree, "TangentialDistortion", 2) if "TangentialDistortion" in tree else np.zeros(2)
+    tangential = _numbers(tree, "TangentialDistortion", 2)
     if len(radial) not in (2, 3):
         raise InputError("RadialDistortion must be 2 or 3 numbers; correct it")
     k1, k2, k3 = [*radial, 0.0][:3]

@@ -56,6 +56,8 @@ def _orb(camera: str, model: str = "type", sides: tuple[str, str] = ("width", "h
         ),
         model=f"{re.sub(r'[12]', '', camera)}{model}",
         size=under(re.sub(r"[12]", "", camera), *sides),
+        optional="all",
+        aside=("bf", "fps", "focal_x_baseline", "depth_threshold", "imageScale"),
     )
 
 
@@ -298,11 +300,14 @@ _VIKIT = CameraKeys(
     "vikit",
     under("cam_", "fx", "fy", "cx", "cy"),
     (
+        Lens(("Pinhole",), "k1k2p1p2", under("cam_d", "0", "1", "2", "3")),
         Lens(("Pinhole",), "plumb_bob", under("cam_d", "0", "1", "2", "3", "4")),
         Lens(("EquidistantCamera",), "fisheye", K4),
     ),
     model="cam_model",
     size=("cam_width", "cam_height"),
+    optional="all",
+    aside=("scale",),
 )
 
 

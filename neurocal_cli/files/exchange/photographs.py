@@ -29,6 +29,10 @@ from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.tree_fields import Field
 
 # nerfstudio and instant-ngp; poses map the camera to the world, with x right, y up, z backwards.
+_ASIDE = (
+    "camera_angle_x", "camera_angle_y", "scale", "aabb_scale", "offset", "integer_depth_scale", "fps",
+    "timestamp", "time", "sharpness", "x_fov", "y_fov",
+)  # fmt: skip
 _NERF = CameraKeys(
     "nerfstudio",
     ("fl_x", "fl_y", "cx", "cy"),
@@ -40,6 +44,8 @@ _NERF = CameraKeys(
     model="camera_model",
     size=("w", "h"),
     first_pixel=0.5,
+    optional="any",
+    aside=_ASIDE,
 )
 _OWN = {"fl_x", "fl_y", "cx", "cy", "w", "h", *FIVE, "k4"}
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -68,6 +74,12 @@ def _read_nerf(document: Document) -> CameraSet:
                 "has camera_angle_x without w, h, or no angle of a camera; give --image-size W H"
             )
         tree["fl_x"] = 0.5 * root["w"].number() / float(np.tan(half))
+    missing = [key for key in ("fl_y", "cx", "cy") if key not in tree]
+    for key, value in {**tree, **(frames[0] if frames else {})}.items() if missing else ():
+        if isinstance(value, float) and key not in (*_OWN, *_ASIDE):
+            raise InputError(
+                f"has no {missing[0]}, and {key[:40]!r} may be it; correct its name, or remove it"
+            )
     tree.setdefault("fl_y", tree["fl_x"])
     root = Field(tree, document.source)
     for key, side in (("cx", "w"), ("cy", "h")):
@@ -124,14 +136,15 @@ _NERFIES = CameraKeys(
     size=("image_size",),
     skew="skew",
     first_pixel=0.5,
+    optional="any",
 )  # fmt: skip
 
 
 def _read_nerfies(document: Document) -> CameraSet:
     root = document.root
     fy = root["focal_length"].number() * root["pixel_aspect_ratio"].number()
-    lens = root.first(("tangential_distortion", "tangential"))
-    tree = {**root.value, "fy": fy, "tangential_distortion": None if lens is None else lens.value}
+    key = "tangential" if "tangential" in root else "tangential_distortion"
+    tree = {**root.value, "fy": fy, "tangential_distortion": root[key].value}
     R = root["orientation"].array(3, 3)
     pose = Pose(R, -R @ root["position"].array(3))
     return mounted([_NERFIES.camera(Field(tree, root.source))], [pose], "Nerfies", None, "world")
@@ -140,7 +153,9 @@ def _read_nerfies(document: Document) -> CameraSet:
 NERFIES = Format(
     "Nerfies",
     _NERFIES.models,
-    matches=lambda document: {"orientation", "position", "pixel_aspect_ratio"} <= set(document.tree),
+    matches=lambda document: (
+        {"orientation", "position", "focal_length", "principal_point"} <= set(document.tree)
+    ),
     read=_read_nerfies,
     files="camera of Nerfies, HyperNeRF, DyCheck: JSON",
     skew=True,

@@ -45,18 +45,14 @@ _METASHAPE = CameraKeys(
     size=("width", "height"),
     skew="b2",
     first_pixel=0.5,
+    optional="any",
+    aside=("f", "b1", "skew", "date"),
+    complete=True,
 )
-_OTHERS = {"frame": ("k4", "p3", "p4"), "fisheye": ("p1", "p2", "p3", "p4")}  # not in our models
 
 
 def _metashape_camera(tree: Mapping[str, Any], source: str) -> Camera:
     root = Field({"projection": "frame", **tree}, source)
-    kind = "frame" if root["projection"].value == "frame" else "fisheye"
-    for key in _OTHERS[kind]:
-        if root.get(key, 0.0).number():
-            raise InputError(
-                f"the coefficient {key} of Metashape's {kind} is not known here; calibrate it without"
-            )
     width, height = root["width"].integer(1), root["height"].integer(1)
     f = root["f"].number() if "f" in root else root["fy"].number()
     middle = (0.5 * width, 0.5 * height) if "f" in root else (0.0, 0.0)  # older versions count from the edge
@@ -67,9 +63,7 @@ def _metashape_camera(tree: Mapping[str, Any], source: str) -> Camera:
         "cy": root.get("cy", 0.0).number() + middle[1],
         "b2": root.get("b2", 0.0).number() + root.get("skew", 0.0).number(),
     }
-    zeros = dict.fromkeys((*_BROWN, "k4"), 0.0)
-    plain = {key: value for key, value in root.value.items() if key not in _OTHERS[kind]}
-    return _METASHAPE.camera(Field({**zeros, **plain, **own}, source))
+    return _METASHAPE.camera(Field({**root.value, **own}, source))
 
 
 def _read_metashape(document: Document) -> CameraSet:
@@ -197,7 +191,7 @@ def _read_alicevision(document: Document) -> CameraSet:
                       else entry["pxFocalLength"].array(2).tolist())  # fmt: skip
         else:
             fx = entry["focalLength"].number() / entry["sensorWidth"].number() * size[0]
-            ratio = entry.get("pixelRatio", 1.0).number()
+            ratio = entry["pixelRatio"].number()
             fy = fx * ratio if version >= [1, 2, 5] else fx / ratio
         kind, lens = entry["type"].text(), entry.get("distortionType", "").text()
         tree = {"fx": fx, "fy": fy, "cx": c[0], "cy": c[1], "model": lens if kind == "pinhole" else kind}
@@ -236,10 +230,13 @@ _OPENSFM = CameraKeys(
 )
 
 
+_OLD, _CENTRED = {"projection_type": "perspective"}, {"c_x": 0.0, "c_y": 0.0}
+
+
 def _opensfm_parts(document: Document) -> dict[str, Field]:
     root = Field(document.tree, document.source)
     return {
-        name: Field({"projection_type": "perspective", "c_x": 0.0, "c_y": 0.0, **part}, root.source, name)
+        name: Field({**_OLD, **({} if "focal_x" in part else _CENTRED), **part}, root.source, name)
         for name, part in document.tree.items()
         if isinstance(part, dict) and {"focal", "focal_x"} & set(part) and {"width", "height"} <= set(part)
     }

@@ -24,7 +24,10 @@ _ZED_SIZES = {
     "FHD1200": (1920, 1200), "SVGA": (960, 600), "QHDPLUS": (3200, 1800), "4K": (3840, 2160),
 }  # fmt: skip
 _ZED = CameraKeys(
-    "ZED", ("fx", "fy", "cx", "cy"), (Lens(("",), "plumb_bob", FIVE), Lens(("",), "rational", EIGHT))
+    "ZED",
+    ("fx", "fy", "cx", "cy"),
+    (Lens(("",), "plumb_bob", FIVE), Lens(("",), "rational", EIGHT)),
+    optional="any",
 )
 
 
