@@ -191,9 +191,11 @@ def _formats_page() -> str:
         "`--distortion` says which; numbers that may be the distortion and are under no known name; two "
         "values of one thing; two cameras without a pose between them; pickles of Python and objects of "
         "MATLAB's classes; several cameras that differ and have no pose between them; what is in mm of a "
-        "sensor or relative to an image whose size is not told (OpenPTV, Pix4D, RealityCapture, Bundler, "
-        "lensfun). A curve of the radius that is no model here, OCamCalib's polynomial or the FOV model, is "
-        "read as the nearest fisheye, and a warning says by how many pixels it differs.",
+        "sensor or relative to an image whose size is not told (Pix4D's `.cam`, RealityCapture, Bundler, "
+        "ContextCapture, fSpy, Unreal, lensfun); formulas that are not documented or no model here (Vicon, "
+        "Qualisys, OptiTrack, Human3.6M, MicMac, Project Aria, Apple's tables). A curve of the radius that "
+        "is no model here, the polynomials of OCamCalib and WoodScape or the FOV model, is read as the "
+        "nearest fisheye, and a warning says by how many pixels it differs.",
     ]
     return "\n\n".join(parts) + "\n"
 

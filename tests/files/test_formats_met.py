@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.io import savemat
+from scipy.spatial.transform import Rotation
 from test_other_programs import POINT, check, rotated
 
 from neurocal_cli.camera.geometry import Array
@@ -103,6 +104,26 @@ LIBCALIB = {
     "k5": -0.01,
     "k6": 0.002,
 }
+
+
+def argoverse(R: Array, t: Array) -> Any:
+    """A camera with the pose R X + t of the vehicle."""
+    x, y, z, w = Rotation.from_matrix(R.T).as_quat()
+    body = {"rotation": {"coefficients": [w, x, y, z]}, "translation": (-R.T @ t).tolist()}
+    names = ("focal_length_x_px_", "focal_length_y_px_", "focal_center_x_px_", "focal_center_y_px_")
+    lens = {"skew_": 0.0, "distortion_coefficients_": [*D5[:2], D5[4]]}
+    return {**dict(zip(names, FXY.values(), strict=True)), **lens, "vehicle_SE3_camera_": body}
+
+
+PIX4D = (
+    "fileName imageWidth imageHeight\ncamera matrix K [3x3]\nradial distortion [3x1]\ntangential distortion "
+    "[2x1]\ncamera position t [3x1]\ncamera rotation R [3x3]\ncamera model m = K [R|-Rt] X\n\n"
+) + "".join(
+    f"a photo {k}.jpg 640 480\n800.5 0 321.3\n0 801.25 238.7\n0 0 1\n{D5[0]} {D5[1]} {D5[4]}\n"
+    f"{D5[2]} {D5[3]}\n1 2 {k}\n1 0 0\n0 -1 0\n0 0 -1\n"
+    for k in (3, 4)
+)
+DEWARP = f"2020-09-02;800.5,801.25,1.8,-0.8,{','.join(map(str, D5))}"
 # Of each kind: the text or the tree, the entries of its camera, the coefficients, and the size.
 MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
     "OpenCV in ROS parameters": (
@@ -120,6 +141,15 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         },
         E,
         D5,
+        S,
+    ),
+    "Pix4D": (PIX4D, E, D5, S),
+    "kapture": (
+        "# kapture format: 1.1\n# sensor_id, name, sensor_type, [sensor_params]+\n"
+        f"a, , camera, OPENCV, 640, 480, 800.5, 801.25, 321.8, 239.2, {', '.join(map(str, D4))}\n"
+        "g, , gnss, E\n",
+        E,
+        D4,
         S,
     ),
     "Polycam": (
@@ -645,6 +675,17 @@ RIGS: dict[str, tuple[Any, list[float], list[Array]]] = {
         D5,
         [TURNED],
     ),
+    "Argoverse": (
+        {
+            "camera_data_": [
+                {"key": f"image_raw_{k}", "value": argoverse(R_, t_)}
+                for k, (R_, t_) in enumerate(((np.eye(3), np.zeros(3)), (np.array(R), np.array(SHIFT))))
+            ],
+            "vehicle_SE3_up_lidar_": {},
+        },
+        [*D5[:2], 0, 0, D5[4]],
+        [TURNED],
+    ),
     "entries of two sides": (
         {f"{side}_intrinsics": {**FXY, **NAMED} for side in ("left", "right")} | {"R": R, "T": SHIFT},
         D5,
@@ -803,6 +844,36 @@ REFUSED: dict[str, tuple[Any, str]] = {
         "is a camera of HALCON in metres",
     ),
     "Pix4D": ("Pix4D camera calibration file 0\nF 4.7\nPx 3.08\n", "is a camera of Pix4D in mm"),
+    "Vicon": (
+        '<?xml version="1.0"?>\n<Cameras><Camera><KeyFrames><KeyFrame FOCAL_LENGTH="1728" '
+        'VICON_RADIAL2="ViconRadial2 0 0 1e-8 1e-15 0"/></KeyFrames></Camera></Cameras>',
+        "is a calibration of Vicon",
+    ),
+    "Qualisys": (
+        "<?xml version='1.0'?>\n<calibration created='x' qtm-version='2024.3'><cameras/></calibration>",
+        "is a calibration of Qualisys, in 1/64",
+    ),
+    "OptiTrack": ('<?xml version="1.0"?><Profile><Intrinsic KC1="1"/></Profile>', "of OptiTrack's Motive"),
+    "VideoPose3D": (
+        {"center": [1, 2], "focal_length": [3, 4], "tangential_distortion": [0, 1], "res_w": 1000},
+        "holds cameras of Human3.6M (VideoPose3D)",
+    ),
+    "ContextCapture": ('<?xml version="1.0"?><OpticalProperties version="1.0"/>', "ContextCapture (iTwin)"),
+    "MicMac": ('<?xml version="1.0" ?><ExportAPERO/>', "is a camera of MicMac"),
+    "fSpy": ({"relativeFocalLength": 1.9, "viewTransform": {}}, "is a camera of fSpy"),
+    "Aria": ({"CameraCalibrations": []}, "is a calibration of Project Aria"),
+    "Apple": (
+        {"intrinsic_matrix": K, "lens_distortion_lookup_table": [0.0, 0.01]},
+        "AVFoundation, whose distortion is a table",
+    ),
+    "Unreal": ({"cameraParameterTables": []}, "is a lens of Unreal"),
+    "ScanNet": (
+        "m_versionNumber = 4\nm_calibrationColorIntrinsic = 1170 0 647 0 0 1170 483 0 0 0 1 0 0 0 0 1\n",
+        "give intrinsic_color.txt",
+    ),
+    "AprilCal": ("aprilCameraCalibration {\n names = [ a ];\n}\n", "is a configuration of AprilCal"),
+    "DJI": (f"Dewarp Data : {DEWARP}\n", "give --image-size W H"),
+    "a damaged image of Pix4D": (PIX4D.replace("0 0 1\n", "0 0\n", 1), "is damaged; export the file again"),
     "Bundler": ("# Bundle file v0.3\n1 0\n800 0 0\n", "is a model of Bundler"),
     "VisualSFM": ("NVM_V3 \n\n1\na.jpg 800 1 0 0 0 0 0 0 0 0\n", "is a model of VisualSFM"),
     "RealityCapture": (
@@ -840,6 +911,48 @@ def test_what_cannot_be_read_is_named(kind: str, tmp_path: Path) -> None:
         read_cameras([written(content, tmp_path)])
     assert message in str(caught.value)
     assert str(caught.value).isprintable()
+
+
+def test_the_camera_in_a_photograph_of_a_dji_is_read(tmp_path: Path) -> None:
+    import cv2
+
+    (tmp_path / "a.xmp").write_text(f'<x:xmpmeta drone-dji:DewarpData="{DEWARP}"/>')
+    check(read_cameras([tmp_path / "a.xmp"], size=S).cameras[0], E, D5)
+    image = cv2.imencode(".jpg", np.zeros((480, 640, 3), np.uint8))[1].tobytes()
+    data = b"http://ns.adobe.com/xap/1.0/\0" + (tmp_path / "a.xmp").read_bytes()
+    data = b"\xff\xe1" + (len(data) + 2).to_bytes(2, "big") + data
+    (tmp_path / "a.jpg").write_bytes(image[:2] + data + image[2:])
+    camera = read_cameras([tmp_path / "a.jpg"]).cameras[0]
+    check(camera, E, D5)
+    assert camera.image_size == S
+
+
+def test_the_poses_of_pix4d_are_those_of_its_images(tmp_path: Path) -> None:
+    found = read_cameras([written(PIX4D, tmp_path)])
+    assert list(found.poses) == ["a photo 3.jpg", "a photo 4.jpg"]
+    assert found.poses["a photo 3.jpg"].to_camera(np.array([[2.0, 2, -7]])).tolist() == [[1, 0, 10]]
+
+
+def test_the_polynomial_of_woodscape_is_the_nearest_fisheye(tmp_path: Path) -> None:
+    k, offset = [339.749, -31.988, 48.275, -7.201], [3.942, -3.093]
+    own = {"model": "radial_poly", "poly_order": 4, "width": 1280.0, "height": 966.0, "aspect_ratio": 1.0}
+    own |= {f"k{n}": one for n, one in enumerate(k, 1)} | dict(
+        zip(("cx_offset", "cy_offset"), offset, strict=True)
+    )
+    body = {"quaternion": Rotation.from_rotvec(TURN).as_quat().tolist(), "translation": [1.0, 2.0, 3.0]}
+    warnings: list[str] = []
+    tree = {"intrinsic": own, "extrinsic": body, "name": "FV"}
+    found = read_cameras([written(tree, tmp_path)], warnings=warnings)
+    theta, phi = np.linspace(0.01, 1.5, 50), np.linspace(0, 6, 50)
+    rays = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    radius = np.polynomial.polynomial.polyval(theta, [0, *k])
+    middle = np.array([639.5, 482.5]) + offset
+    expected = middle + radius[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    assert np.abs(found.cameras[0].project(rays)[0] - expected).max() < 0.6
+    assert "moves pixels by 0.5" in warnings[0]
+    (pose,) = found.poses.values()
+    point = np.add(Rotation.from_rotvec(TURN).apply([0.1, 0.2, 5.0]), [1.0, 2.0, 3.0])
+    assert np.abs(pose.to_camera(point[None]) - [0.1, 0.2, 5.0]).max() < 1e-12
 
 
 @pytest.mark.parametrize("tree", [{"mtx": K, "dist": [D5]}, {"cameraMatrix": K, "distCoeffs": [D5], "fx": 3}])

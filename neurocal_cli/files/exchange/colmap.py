@@ -25,6 +25,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.reconstruction import only
 from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.yaml_text import number
 
@@ -86,7 +87,7 @@ def read_folder(folder: str) -> CameraSet:
 def is_cameras(document: Document) -> bool:
     """Whether this is ``cameras.txt``, ``cameras.bin`` or a dictionary of a camera."""
     data = document.data
-    if _stated_model(document) is not None:
+    if _stated_model(document) is not None or _sensors(document) is not None:
         return True
     if len(data) < 48 or document.is_text:
         return bool(_LINE(document.text))
@@ -102,6 +103,18 @@ def _stated_model(document: Document) -> str | None:
     return name if known and {"params", "width", "height"} <= set(tree) else None
 
 
+def _sensors(document: Document) -> dict[str, Camera] | None:
+    """The cameras of a file of kapture, whose models are those of COLMAP; None for other files."""
+    if not document.text.startswith("# kapture format"):
+        return None
+    rows = [[word.strip() for word in line.split(",")] for line in document.text.splitlines()]
+    return {
+        row[0]: _camera(["1", *row[3:]], document.source, k)
+        for k, row in enumerate(rows, start=1)
+        if row[2:3] == ["camera"]
+    }
+
+
 def read_file(document: Document) -> CameraSet:
     """Read ``cameras.txt`` or ``cameras.bin`` with one camera."""
     source = document.source
@@ -109,6 +122,8 @@ def read_file(document: Document) -> CameraSet:
         sides = [document.root[side].integer(1) for side in ("width", "height")]
         words = ["1", stated, *map(str, sides), *map(repr, document.root["params"].array(-1).tolist())]
         return CameraSet((_camera(words, source, 1),), program="COLMAP")
+    if (sensors := _sensors(document)) is not None:
+        return only(sensors.values(), sensors, "kapture")
     lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
     return CameraSet(tuple(_cameras(lines, source).values()), program="COLMAP")
 

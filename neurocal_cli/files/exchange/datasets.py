@@ -1,4 +1,4 @@
-"""Formats of data sets: KITTI, Middlebury, MVSNet, KWIVER and DROID-SLAM."""
+"""Formats of data sets: KITTI, Argoverse, Middlebury, MVSNet, KWIVER and DROID-SLAM."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, mounted
+from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens, under
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_quaternion, inverse, mounted
 from neurocal_cli.files.exchange.document import Document, assignments
 from neurocal_cli.files.tree_fields import Field, is_number
 
@@ -67,6 +67,42 @@ KITTI = Format(
     rig="`R_`, `T_` from camera 0; `P0` to `P3`",
 )
 
+
+# Argoverse 1: poses of the cameras in the vehicle, quaternions w, x, y, z, and k1, k2, k3 of the lens.
+_ARGOVERSE = CameraKeys(
+    "Argoverse",
+    ("focal_length_x_px_", "focal_length_y_px_", "focal_center_x_px_", "focal_center_y_px_"),
+    (Lens(("",), "plumb_bob", (*under("distortion_coefficients_/", "0", "1"), NOTHING, NOTHING,
+                               "distortion_coefficients_/2")),),
+    skew="skew_",
+)  # fmt: skip
+
+
+def _read_argoverse(document: Document) -> CameraSet:
+    cameras, poses = [], []
+    for entry in document.root["camera_data_"].items():
+        part = entry["value"]
+        cameras.append(_ARGOVERSE.camera(part, entry["key"].text().removeprefix("image_raw_")))
+        body = part["vehicle_SE3_camera_"]
+        R = from_quaternion(body["rotation"]["coefficients"].array(4))
+        poses.append(inverse(Pose(R, body["translation"].array(3))))
+    if any(camera.distortion.coefficients.any() for camera in cameras):
+        document.notes.append(
+            f"{document.source}: Argoverse's own programs project without the distortion, which is read here"
+        )
+    return mounted(cameras, poses, "Argoverse")
+
+
+ARGOVERSE = Format(
+    "Argoverse",
+    _ARGOVERSE.models,
+    matches=lambda document: "camera_data_" in document.tree,
+    read=_read_argoverse,
+    files="vehicle_calibration_info.json of Argoverse 1",
+    skew=True,
+    most_cameras=99,
+    rig="`vehicle_SE3_camera_` from each camera to the vehicle",
+)
 
 # Middlebury and ETH3D: a rectified pair, whose second camera is at (baseline, 0, 0) of the first.
 

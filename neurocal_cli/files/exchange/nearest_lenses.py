@@ -1,4 +1,4 @@
-"""Cameras whose formula is none of ours, as the nearest of ours: OCamCalib, the FOV model, OpenPTV.
+"""Cameras whose formula is none of ours, as the nearest of ours: OCamCalib, WoodScape, FOV, OpenPTV.
 
 A curve of the radius over the angle is fitted by f (theta + k1 theta^3 + ... + k4 theta^9). The largest
 difference over the image is told, in pixels.
@@ -21,7 +21,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, mounted
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_quaternion, mounted
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field, is_number
@@ -102,6 +102,49 @@ def _read_ocam(document: Document) -> CameraSet:
     camera = Camera(Intrinsics.from_matrix(K), lens, (int(width), int(height)))
     return CameraSet((camera,), program="OCamCalib")
 
+
+# WoodScape: the radius [px] is a polynomial of the angle [rad], about a point from the middle of the image.
+# The pose is that of the camera in the vehicle, the quaternion x, y, z, w.
+_WOODSCAPE_KEYS = {"model", "k1", "k2", "k3", "k4", "cx_offset", "cy_offset", "width", "height"}
+
+
+def _is_woodscape(document: Document) -> bool:
+    own = document.tree.get("intrinsic")
+    return isinstance(own, dict) and own.keys() >= _WOODSCAPE_KEYS and own["model"] == "radial_poly"
+
+
+def _read_woodscape(document: Document) -> CameraSet:
+    root = document.root
+    own = root["intrinsic"]
+    width, height = own["width"].integer(1), own["height"].integer(1)
+    k = np.array([0.0, *(own[f"k{n}"].number() for n in (1, 2, 3, 4))])
+    aspect = own.get("aspect_ratio", 1.0).number()
+    u0, v0 = (
+        0.5 * (side - 1) + own[key].number() for side, key in ((width, "cx_offset"), (height, "cy_offset"))
+    )
+    far = np.hypot(max(u0, width - u0), max(v0, height - v0) / aspect)
+    theta = np.linspace(0, np.pi, 4 * _SAMPLES)
+    radius = np.polynomial.polynomial.polyval(theta, k)
+    end = int(np.argmax((radius > far) | (np.gradient(radius) <= 0))) or len(theta)
+    f, lens = fitted(theta[:end], radius[:end], 1.0, document, "the polynomial of WoodScape")
+    camera = Camera(
+        Intrinsics(f, f * aspect, u0, v0), lens, (width, height), root.get("name", "camera").text()
+    )
+    if "extrinsic" not in root:
+        return CameraSet((camera,), program="WoodScape")
+    body = root["extrinsic"]
+    R = from_quaternion(np.roll(body["quaternion"].array(4), 1))
+    pose = Pose(R.T, -R.T @ body["translation"].array(3))
+    return mounted([camera], [pose], "WoodScape", "m", "vehicle")
+
+
+WOODSCAPE = Format(
+    "WoodScape",
+    ("fisheye",),
+    matches=_is_woodscape,
+    read=_read_woodscape,
+    files="calibration of WoodScape, JSON, as the nearest fisheye",
+)
 
 OCAM = Format(
     "OCamCalib",

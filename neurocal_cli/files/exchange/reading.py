@@ -61,6 +61,7 @@ FORMATS: dict[str, Format] = {
 READ: tuple[Format, ...] = (
     neurocal.FORMAT,
     nearest_lenses.OCAM,
+    nearest_lenses.WOODSCAPE,
     matlab.FORMAT,
     colmap.FORMAT,
     calibrators.MRCAL,
@@ -73,7 +74,9 @@ READ: tuple[Format, ...] = (
     sensors.OAK,
     sensors.REALSENSE,
     sensors.KINECT,
+    sensors.DJI,
     datasets.KITTI,
+    datasets.ARGOVERSE,
     datasets.MIDDLEBURY,
     datasets.MVSNET,
     datasets.KRTD,
@@ -92,6 +95,7 @@ READ: tuple[Format, ...] = (
     photographs.NERFSTUDIO,
     photographs.NERFIES,
     reconstruction.METASHAPE,
+    reconstruction.PIX4D,
     reconstruction.OPENMVG,
     reconstruction.ALICEVISION,
     reconstruction.OPENSFM,
@@ -141,8 +145,9 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "images",
     ),
     (
-        r"Pix4D camera calibration",
-        "is a camera of Pix4D in mm of the sensor; export it in px, or calibrate its images",
+        r"Pix4D (?:camera calibration|internal camera)",
+        "is a camera of Pix4D in mm of the sensor or from its middle; give calibrated_camera_parameters.txt "
+        "of the same project",
     ),
     (
         r"#\s*Bundle file",
@@ -151,6 +156,61 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
     (
         r"NVM_V3",
         "is a model of VisualSFM, whose image sizes and principal points are not in it; give COLMAP's model",
+    ),
+    (
+        r".*<KeyFrame [^>]*VICON_RADIAL",
+        "is a calibration of Vicon, whose distortion undistorts, in px; Pose2Sim converts it to a TOML that "
+        "is read here",
+    ),
+    (
+        r".*<calibration\b[^>]*\bqtm-version=",
+        "is a calibration of Qualisys, in 1/64 of a pixel, and the unit of its distortion is not documented; "
+        "Pose2Sim converts it to a TOML that is read here",
+    ),
+    (
+        lambda d: "<Profile" in d.text[:2000] and "KC1=" in d.text[:100_000],
+        "is a calibration of OptiTrack's Motive, whose distortion is not documented; calibrate the images",
+    ),
+    (
+        lambda d: '"tangential_distortion"' in d.text and '"center"' in d.text and '"res_w"' in d.text,
+        "holds cameras of Human3.6M (VideoPose3D), whose programs differ in the order and the factor of the "
+        "tangential terms; write fx, fy, cx, cy and k1, k2, p1, p2, k3 of OpenCV",
+    ),
+    (
+        r".*<OpticalProperties\b",
+        "is a camera of ContextCapture (iTwin) in mm of the sensor; export COLMAP's model, or calibrate the "
+        "images",
+    ),
+    (
+        r".*<ExportAPERO\b",
+        "is a camera of MicMac, whose distortion is in px about a centre of its own; undistort the images by "
+        "mm3d Drunk, or calibrate them",
+    ),
+    (
+        lambda d: {"relativeFocalLength", "viewTransform"} <= set(d.tree),
+        "is a camera of fSpy, relative to the image and from vanishing points; calibrate its images",
+    ),
+    (
+        lambda d: "CameraCalibrations" in d.tree,
+        "is a calibration of Project Aria, whose lens FisheyeRadTanThinPrism is not known here; rectify its "
+        "images to a linear camera with Aria's tools, and give that camera",
+    ),
+    (
+        lambda d: re.search(r"lens_?distortion_?lookup_?table", d.text[:1_000_000], re.IGNORECASE),
+        "is a calibration of Apple's AVFoundation, whose distortion is a table; rectify the images by it, "
+        "and give the camera matrix alone",
+    ),
+    (
+        lambda d: "cameraParameterTables" in d.tree,
+        "is a lens of Unreal, relative to the image and in tables of zoom and focus; calibrate its images",
+    ),
+    (
+        r"m_versionNumber\s*=.*m_calibrationColorIntrinsic",
+        "holds the two cameras of a ScanNet scan; give intrinsic_color.txt or intrinsic_depth.txt beside it",
+    ),
+    (
+        r"aprilCameraCalibration\s*\{",
+        "is a configuration of AprilCal; write fc, cc, kc and lc as fx, fy, cx, cy, k1, k2, p1, p2, k3",
     ),
     (
         lambda d: "capturingreality.com" in d.text[:2000],

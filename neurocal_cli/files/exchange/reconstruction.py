@@ -1,14 +1,17 @@
-"""Formats of reconstruction from photographs: Metashape, OpenMVG, AliceVision, OpenSfM and OpenDroneMap.
+"""Formats of reconstruction from photographs: Metashape, OpenMVG, AliceVision, OpenSfM, OpenDroneMap, Pix4D.
 
 Their files hold the cameras of a whole project; one camera is read, or the one that all are alike.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import xml_root
 from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens, under
@@ -266,4 +269,43 @@ OPENSFM = Format(
     ),
     read=_read_opensfm,
     files="cameras.json, reference of a camera model; also of OpenDroneMap",
+)
+
+# Pix4D's calibrated_camera_parameters.txt: of each image K, the distortion, and the pose, m = K [R|-Rt] X.
+_PIX4D = CameraKeys("Pix4D", ("K:matrix",), (Lens(("",), "plumb_bob", ("D",)),), size=("size",))
+_PIX4D_HEAD = re.compile(r"\A\s*fileName imageWidth imageHeight\s.*?\[R\|-Rt\] X\s*\n", re.DOTALL).match
+_PIX4D_ROWS = [3, 3, 3, 3, 3, 2, 3, 3, 3, 3]  # words of a name with its size, and numbers
+
+
+def _read_pix4d(document: Document) -> CameraSet:
+    head = _PIX4D_HEAD(document.text)
+    assert head is not None  # `matches`
+    rows = [line.split() for line in document.text[head.end() :].splitlines() if line.strip()]
+    cameras, poses, unit = [], {}, len(_PIX4D_ROWS)
+    for k in range(0, len(rows), unit):
+        image = rows[k : k + unit]
+        name, *words = " ".join(image[0][:-2]), *image[0][-2:], *(word for row in image[1:] for word in row)
+        if [len(row) for row in image[1:]] != _PIX4D_ROWS[1:] or len(image[0]) < _PIX4D_ROWS[0]:
+            raise InputError(f"the block of the image {name[:40]!r} is damaged; export the file again")
+        values = Field(words, document.source, name[:40]).array(-1)
+        (width, height), K, (k1, k2, k3, p1, p2) = values[:2].tolist(), values[2:11], values[11:16].tolist()
+        tree = {"K": K.tolist(), "D": [k1, k2, p1, p2, k3], "size": [width, height]}
+        cameras.append(_PIX4D.camera(Field(tree, document.source)))
+        R = values[19:28].reshape(3, 3)
+        poses[name] = Pose(R, -R @ values[16:19])
+    document.warnings.append(
+        f"{document.source}: Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
+        "which may be half a pixel off"
+    )
+    return replace(only(cameras, poses, "Pix4D"), poses=poses)
+
+
+PIX4D = Format(
+    "Pix4D",
+    _PIX4D.models,
+    matches=lambda document: _PIX4D_HEAD(document.text[:2000]),
+    read=_read_pix4d,
+    files="calibrated_camera_parameters.txt",
+    poses=True,
+    most_cameras=1,
 )

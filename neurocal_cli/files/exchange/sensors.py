@@ -1,4 +1,4 @@
-"""Calibrations that makers store in their cameras: ZED, OAK (DepthAI) and Azure Kinect."""
+"""Calibrations that makers store in their cameras: ZED, RealSense, OAK (DepthAI), Azure Kinect, and DJI."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, CameraKeys, Len
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_vector, inverse, mounted
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.reconstruction import only
+from neurocal_cli.files.image_files import read_header
 from neurocal_cli.files.tree_fields import Field
 
 _STILL = Pose(np.eye(3), np.zeros(3))
@@ -211,4 +212,38 @@ KINECT = Format(
     matches=lambda document: "CalibrationInformation" in document.tree,
     read=_read_kinect,
     files="raw calibration, JSON, with `--image-size`",
+)
+
+# DJI's DewarpData, in the XMP of a photograph or as exiftool prints it: a date; fx, fy, the principal point
+# from the middle of the image, and k1, k2, p1, p2, k3. The size is that of the photograph.
+_DJI = CameraKeys("DJI", ("fx", "fy", "cx", "cy"), (Lens(("",), "plumb_bob", FIVE),), size=("size",))
+_DEWARP = re.compile(rb"Dewarp ?Data\s*[=:>]\s*[\"']?(?:[-\d]+;)?((?:\s*[-+.\deE]+,){8}\s*[-+.\deE]+)")
+_XMP_BYTES = 300_000  # of a photograph, in which its XMP stands
+
+
+def _dewarp(document: Document) -> re.Match[bytes] | None:
+    return _DEWARP.search(document.data[:_XMP_BYTES])
+
+
+def _read_dji(document: Document) -> CameraSet:
+    found = _dewarp(document)
+    assert found is not None  # `matches`
+    size = document.size
+    if not document.is_text:
+        header = read_header(document.data, document.source)
+        size = header.width, header.height
+    if size is None:
+        raise InputError("holds the camera of a DJI, from the middle of its images; give --image-size W H")
+    values = dict(zip(("fx", "fy", "cx", "cy", *FIVE), map(float, found[1].split(b",")), strict=True))
+    values["cx"] += 0.5 * (size[0] - 1)
+    values["cy"] += 0.5 * (size[1] - 1)
+    return CameraSet((_DJI.camera(Field({**values, "size": list(size)}, document.source)),), program="DJI")
+
+
+DJI = Format(
+    "DJI",
+    _DJI.models,
+    matches=_dewarp,
+    read=_read_dji,
+    files="photographs with DewarpData, or its text with `--image-size`",
 )
