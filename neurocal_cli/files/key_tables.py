@@ -3,7 +3,8 @@
 A table of keys is a text, ``"seed: integer, center=centre?: pair"``: the names of keys, those of the
 attributes with their values if they differ, and kinds. A key with ``?`` is left out of the file if its value
 is the empty one of its kind, which it has if it is left out. Sizes such as ``3x4`` are arrays; ``n`` is any
-length.
+length. A table of columns, ``"point?: label, found=X Y Z: number"``, has the names of the columns of each
+attribute, and what stands in them.
 
 Long columns are texts of comma-separated numbers, ``X: ['0.0,20.0,40.0']``, or packed. PyYAML's pure-Python
 parser takes 50 us per number, but only 0.3 us per character of a text. A number of 17 digits has 20
@@ -26,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
     block,
@@ -69,35 +69,89 @@ def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterato
         yield f"{name}: [{', '.join(parts)}]"
 
 
-def table_lines(
-    columns: Mapping[str, NDArray[Any] | Sequence[str]], long: bool, indent: int = 4
-) -> Iterator[str]:
-    """Lines of a table: ``columns`` and ``rows``, or only ``columns`` if it is long."""
-    if long:
-        yield from block("columns", column_lines(columns))
-        return
-    cells = [
-        number_words(values) if isinstance(values, np.ndarray) else map(quoted, values)
-        for values in columns.values()
-    ]
-    yield f"columns: [{', '.join(columns)}]"
-    yield "rows:"
-    yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
+class Columns:
+    """The columns of a table by the attributes whose values they hold.
 
+    Parameters
+    ----------
+    table : str
+        See above. In columns stand a label, an integer, a number, or a measure, which may be unknown.
+    """
 
-def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
-    """Read either form of a table as columns, each a list of values."""
-    if isinstance(field["columns"].value, dict):
-        table = read_columns(field["columns"], labels)
-    else:
-        names = field["columns"].texts()
-        rows = [row.value for row in field["rows"].items()]
-        if len(set(names)) < len(names) or any(
-            type(row) is not list or len(row) != len(names) for row in rows
-        ):
-            field.fail(f"a table with {len(names)} columns")
-        table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
-    return as_fields(table, field)
+    def __init__(self, table: str) -> None:
+        self.groups: list[tuple[str, list[str], bool, str]] = []
+        for entry in table.split(","):
+            names, _, kind = entry.partition(":")
+            names, optional = names.strip().removesuffix("?"), names.strip().endswith("?")
+            attribute, _, columns = names.partition("=")
+            self.groups.append((attribute, (columns or attribute).split(), optional, kind.strip()))
+        self.labels = frozenset(
+            name for _, names, _, kind in self.groups if kind == "label" for name in names
+        )
+
+    def of(self, value: Any) -> dict[str, NDArray[Any] | list[str]]:
+        """The columns of an object, or of a dictionary of attributes."""
+        columns: dict[str, NDArray[Any] | list[str]] = {}
+        for attribute, names, optional, kind in self.groups:
+            own = value.get(attribute) if isinstance(value, dict) else getattr(value, attribute)
+            if own is None and optional:
+                continue
+            assert own is not None, attribute
+            if kind == "label":
+                columns[names[0]] = list(map(str, own))
+            else:
+                numbers = np.asarray(own, dtype=int if kind == "integer" else float).reshape(len(own), -1)
+                columns |= {name: numbers[:, k] for k, name in enumerate(names)}
+        return columns
+
+    def lines(self, value: Any, long: bool, indent: int = 2) -> Iterator[str]:
+        """Lines of the table: ``columns`` and ``rows``, or only ``columns`` if it is long."""
+        columns = self.of(value)
+        if long:
+            yield from block("columns", column_lines(columns))
+            return
+        cells = [
+            number_words(values) if isinstance(values, np.ndarray) else map(quoted, values)
+            for values in columns.values()
+        ]
+        yield f"columns: [{', '.join(columns)}]"
+        yield "rows:"
+        yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
+
+    def read(self, field: Field) -> dict[str, Any] | None:
+        """The values of the attributes in either form of a table; None if it has no rows."""
+        if isinstance(field["columns"].value, dict):
+            table = read_columns(field["columns"], self.labels)
+        else:
+            names = field["columns"].texts()
+            rows = [row.value for row in field["rows"].items()]
+            if len(set(names)) < len(names) or any(
+                type(row) is not list or len(row) != len(names) for row in rows
+            ):
+                field.fail(f"a table with {len(names)} columns")
+            table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
+        needed = [name for _, names, optional, _ in self.groups if not optional for name in names]
+        known = {name for _, names, _, _ in self.groups for name in names}
+        if table and not set(needed) <= set(table) <= known:
+            field.fail(f"a table with {', '.join(needed)}")
+        return self.values(table, field) if table else None
+
+    def values(self, table: Mapping[str, list[Any]], field: Field) -> dict[str, Any]:
+        """The values of the attributes, from columns by their names; None for those that are not there."""
+        found: dict[str, Any] = {}
+        for attribute, names, optional, kind in self.groups:
+            if optional and not set(names) <= set(table):
+                found[attribute] = None
+                continue
+            columns = [Field(table[name], field.source, f"{field.path}, column {name},") for name in names]
+            if kind == "label":
+                found[attribute] = columns[0].texts()
+            elif kind == "integer":
+                found[attribute] = np.array([cell.integer() for cell in columns[0].items()], dtype=np.intp)
+            else:
+                numbers = np.array([column.array(-1, unknown=kind == "measure") for column in columns])
+                found[attribute] = numbers.T if len(names) > 1 else numbers[0]
+        return found
 
 
 def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
@@ -109,16 +163,6 @@ def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
     if len(set(map(len, columns.values()))) > 1:
         field.fail("columns of one length")
     return columns
-
-
-def as_fields(columns: Mapping[str, list[Any]], table: Field) -> dict[str, Field]:
-    """Make a field of each column of a table."""
-    return {name: Field(values, table.source, f"{table.path}.{name}") for name, values in columns.items()}
-
-
-def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool = False) -> Array:
-    """(k, N) numbers of some columns; NaN for null, which must be allowed by `unknown`."""
-    return np.array([columns[name].array(-1, unknown=unknown) for name in names])
 
 
 def read_numbers(texts: Sequence[Field]) -> list[Any]:
@@ -266,6 +310,7 @@ _KINDS = {
     "estimate": inline(  # a value and its standard deviation
         _estimate, lambda pair: mapping(value=number(pair[0]), std=number(pair[1]))
     ),
+    "shown": Kind(lambda _: None, lambda key, value, _: [f"{key}: {flow(value)}"]),  # follows from the others
     "square": inline(lambda field: field, flow),  # read as it is, for a size that is known later
 }
 
@@ -301,7 +346,8 @@ class Keys:
                 own = self.computed[name](value)
             else:
                 own = value[attribute] if isinstance(value, dict) else getattr(value, attribute)
-            if not (optional and (own is kind.empty or own == kind.empty)):
+            same = own is kind.empty or (not isinstance(own, np.ndarray) and own == kind.empty)
+            if not (optional and same):
                 yield from kind.lines(name, own, long)
 
     def flow(self, value: Any) -> str:

@@ -27,7 +27,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
 from neurocal_cli.files.exchange.reading import read_intrinsics
-from neurocal_cli.files.key_tables import Keys, Kind, inline, record, table_lines
+from neurocal_cli.files.key_tables import Columns, Keys, Kind, inline, record
 from neurocal_cli.files.points_csv import POINTS, correspondences, format_points
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.table import Table, parse_table
@@ -77,9 +77,7 @@ def _lines(lens: ZoomLens) -> Iterator[str]:
     yield f"format: {_FORMAT}"
     yield f"version: {text(__version__)}"
     yield from _HEAD.lines(lens)
-    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
-    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
-    yield from block("settings", table_lines(columns, long=False, indent=2))
+    yield from block("settings", _settings(lens.controls).lines(lens, False))
     yield "members:"
     for member in lens.members:
         yield f"  - scale: {member.nets.scale}"
@@ -165,7 +163,10 @@ def _lens(block: Field) -> ZoomLens:
     if camera not in ("known", "still", "moving"):
         block["camera"].fail("known, still or moving")
     _check_names(block, camera, names, model)
-    settings, counts, rmse = _settings(block["settings"], len(controls))
+    table = _settings(controls).read(block["settings"])
+    if table is None or not (np.ptp(table["settings"], axis=0) > 0).all():
+        block["settings"]["rows"].fail("several rows of finite settings")
+    settings = table.pop("settings").reshape(-1, len(controls))
     L, S = len(names), len(settings)
     if head["scatter"].shape != (L,):
         block["scatter"].fail(f"{L} finite numbers")
@@ -189,8 +190,7 @@ def _lens(block: Field) -> ZoomLens:
         tables=_table(block["tables"], S, L, Q),
         static=_table(block["static"], S, L, Q),
         variance=fit["variance"],
-        counts=counts,
-        rmse=rmse,
+        **table,
         left_out_px=fit["left_out_px"],
         free_pose_px=np.nan if fit["free_pose_px"] is None else fit["free_pose_px"],
         image_size=size if all(size) else None,
@@ -209,12 +209,8 @@ def _check_names(block: Field, camera: str, names: tuple[str, ...], model: str) 
         block["parameters"].fail(f"the list {', '.join(expected)}")
 
 
-def _settings(field: Field, D: int) -> tuple[Array, NDArray[np.int64], Array]:
-    table = field["rows"].array(-1, D + 2, unknown=True)
-    settings, counts = table[:, :D], table[:, D]
-    if not np.isfinite(table[:, : D + 1]).all() or len(table) < 2 or not (np.ptp(settings, axis=0) > 0).all():
-        field["rows"].fail("several rows of finite settings")
-    return np.ascontiguousarray(settings), counts.astype(np.int64), np.ascontiguousarray(table[:, D + 1])
+def _settings(controls: Sequence[str]) -> Columns:
+    return Columns(f"settings={' '.join(controls)}: number, counts=n_points: integer, rmse=rmse_px: measure")
 
 
 def _member(field: Field, names: tuple[str, ...], D: int) -> Member:

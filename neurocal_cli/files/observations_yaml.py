@@ -6,7 +6,7 @@ view, whose numbers are texts: decimals, or packed if PyYAML would take too long
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from operator import add
 from typing import Any
 
@@ -17,7 +17,11 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import value_failures
 from neurocal_cli.files.key_tables import (
     LONGEST,
+    Columns,
+    Keys,
+    Kind,
     column_lines,
+    inline,
     join_ranges,
     number_words,
     packed_text,
@@ -28,10 +32,37 @@ from neurocal_cli.files.key_tables import (
 )
 from neurocal_cli.files.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import flow, indented, number, quoted
+from neurocal_cli.files.yaml_text import flow, indented, number, quoted, text
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.points import Correspondences
 
+
+def _distance(field: Field) -> Distance:
+    cells = list(field.items())
+    if len(cells) != 4:
+        field.fail("a list of from, to, length, std")
+    start, end, length, std = cells
+    return Distance(start.text(), end.text(), length.number(), std.number())
+
+
+def _distance_lines(key: str, distances: Iterable[Distance], long: bool) -> Iterator[str]:
+    yield f"{key}:  # from, to, length, std"
+    for one in distances:
+        yield f"  - [{quoted(one.start)}, {quoted(one.end)}, {number(one.length)}, {number(one.std)}]"
+
+
+_HEAD = Keys(
+    "undistorted?: text, board?: quoted, distances?: distances",
+    {
+        "text": inline(Field.text, text, ""),
+        "quoted": inline(Field.text, quoted, ""),
+        "distances": Kind(lambda field: tuple(map(_distance, field.items())), _distance_lines, ()),
+    },
+)
+_COLUMNS = Columns(
+    f"view?: label, point?: label, world={' '.join(PLACE)}: number, pixels={' '.join(PIXEL)}: number, "
+    + ", ".join(f"{attribute}={' '.join(names)}?: number" for attribute, names in OPTIONAL.items())
+)
 _MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
 
 
@@ -40,15 +71,7 @@ def observation_lines(points: Correspondences, long: bool) -> list[str]:
     names, blocks = value_columns(points)
     columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
     lines = ["observations:", f"  columns: [{', '.join(columns)}]"]
-    if points.undistorted:
-        lines.append(f"  undistorted: {points.undistorted}")
-    if points.board:
-        lines.append(f"  board: {quoted(points.board)}")
-    if points.distances:
-        lines.append("  distances:  # from, to, length, std")
-        for one in points.distances:
-            ends = f"{quoted(one.start)}, {quoted(one.end)}"
-            lines.append(f"    - [{ends}, {number(one.length)}, {number(one.std)}]")
+    lines += indented(_HEAD.lines(points))
     if len(points) == 0:
         return [*lines, "  rows: []"]
     if long:
@@ -116,34 +139,10 @@ def read_observations(
     if not columns:
         observations["rows"].fail("at least one row")
 
-    def numbers(names: tuple[str, ...]) -> Array:
-        cells = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
-        return np.column_stack([column.array(-1) for column in cells])
-
-    labels = {
-        name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
-    }
     with value_failures(""):
-        world, pixels = numbers(PLACE), numbers(PIXEL)
-        known: dict[str, Any] = {
-            attribute: numbers(names) for attribute, names in OPTIONAL.items() if set(names) <= set(columns)
-        }
-        distances = []
-        for row in observations.get("distances", []).items():
-            cells = list(row.items())
-            if len(cells) != 4:
-                row.fail("a list of from, to, length, std")
-            start, end, length, std = cells
-            distances.append(Distance(start.text(), end.text(), length.number(), std.number()))
         return Correspondences(
-            world,
-            pixels,
-            view=labels.get("view"),
-            point=labels.get("point"),
-            **known,
-            distances=tuple(distances),
-            board=observations.get("board", "").text(),
-            undistorted=observations.get("undistorted", "").text(),
+            **_COLUMNS.values(columns, Field(None, observations.source, stands)),
+            **_HEAD.read(observations),
             image_size=image_size,
             image_center=image_center,
             unit=unit,
@@ -187,20 +186,11 @@ def _long_columns(observations: Field) -> dict[str, list[Any]]:
             entry.fail(f"a list of {len(measured) + 2} texts")
         rows = read_ranges(where, len(places["X"]))
         columns["view"] += [view.text()] * len(rows)
-        for name, values in places.items():
-            columns[name] += [values[row] for row in rows]
-        for name, text in zip(measured, texts, strict=True):
-            numbers = read_packed(text) if packed else read_numbers([text])
-            if len(numbers) != len(rows):
-                text.fail(f"{len(rows)} numbers")
-            columns[name] += numbers
+        for name, all_of in places.items():
+            columns[name] += [all_of[row] for row in rows]
+        for name, numbers in zip(measured, texts, strict=True):
+            values = read_packed(numbers) if packed else read_numbers([numbers])
+            if len(values) != len(rows):
+                numbers.fail(f"{len(rows)} numbers")
+            columns[name] += values
     return columns if columns["view"] else {}
-
-
-def _labels(labels: list[Any], observations: Field, name: str) -> list[str]:
-    if set(map(type, labels)) <= {str}:
-        return labels
-    return [
-        Field(label, observations.source, f"{observations.path}.rows[{k}], {name},").text()
-        for k, label in enumerate(labels)
-    ]

@@ -81,6 +81,8 @@ class Field:
 
     def texts(self) -> list[str]:
         """Value as a list of texts."""
+        if isinstance(self.value, list) and set(map(type, self.value)) <= {str}:
+            return list(self.value)
         return [entry.text() for entry in self.items()]
 
     def names(self, count: int) -> list[str]:

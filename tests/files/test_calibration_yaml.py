@@ -389,7 +389,7 @@ LONG_FAULTS = [
     (r"R_x: \['", "R_x: ['1e999,", ": neurocal.views must be columns of one length"),
     (r"R_x: \['2", "R_x: ['x2", ": neurocal.views.R_x[0] must be numbers with commas between them"),
     (r"R_x: \['2", "R_x: ['3", ": neurocal.views: R11 to R33 and R_x, R_y, R_z disagree"),
-    (r"R_x: \['2\.5", "R_x: ['null", ": neurocal.views.R_x must be n finite numbers"),
+    (r"R_x: \['2\.5", "R_x: ['null", ": neurocal.views, column R_x, must be n finite numbers"),
     (r"    rmse_px: .*\n", "", ": the key neurocal.views.rmse_px is missing"),
     (r'name: \["view00", "view01', 'name: ["view00", "view00', ": neurocal.views.name must be names that"),
     (r'name: \["view00", "view01', 'name: ["view00", "other', ": neurocal.observations: the view 'view01'"),
