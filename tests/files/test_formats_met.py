@@ -144,6 +144,44 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         S,
     ),
     "Pix4D": (PIX4D, E, D5, S),
+    "Blender's NeRF": (
+        {
+            "camera_angle_x": 2 * float(np.arctan(320 / 800.5)),
+            **dict(zip("wh", S, strict=True)),
+            "near": 0.5,
+            "far": 6.5,
+            "frames": [frame(k, rotation=0.0125663706, timestamp=1.5) for k in (1, 2)],
+        },
+        [800.5, 0, 800.5, 319.5, 239.5],
+        [],
+        S,
+    ),
+    "nerfstudio beside other numbers": (
+        {
+            "fl_x": 800.5,
+            "fl_y": 801.25,
+            "cx": 321.8,
+            "cy": 239.2,
+            "w": 640,
+            "h": 480,
+            **BROWN,
+            "near": 0.05,
+            "scene_scale": 1.5,
+            "applied_scale": 0.93,
+            "frames": [frame(1, sharpness=87.5)],
+        },
+        E,
+        D4,
+        S,
+    ),
+    "ORB-SLAM3 beside other numbers": (
+        lines('%YAML:1.0\nCamera.type: "PinHole"\n', "Camera1.", **FX_LINES, **BROWN, overlappingEnd=511)
+        + "Camera.width: 640\nCamera.height: 480\nCamera.fps: 29.97\nCamera.bf: 47.91\nStereo.ThDepth: 40.5\n"
+        "ORBextractor.scaleFactor: 1.2\nIMU.NoiseGyro: 1.7e-4\nViewer.KeyFrameSize: 0.05\n",
+        E,
+        D4,
+        S,
+    ),
     "kapture": (
         "# kapture format: 1.1\n# sensor_id, name, sensor_type, [sensor_params]+\n"
         f"a, , camera, OPENCV, 640, 480, 800.5, 801.25, 321.8, 239.2, {', '.join(map(str, D4))}\n"

@@ -129,14 +129,14 @@ class CameraKeys:
         else:
             fields = {path: find(root, path) for path in lens.places if path != NOTHING}
             stated = any(fields.values())
+            fewest = next(one for one in self.lenses if one.words == lens.words).places
             needed = lens.places if whole else ()
             if stated and not whole:  # later coefficients alone are no distortion
-                fewest = next(one for one in self.lenses if one.words == lens.words).places
                 needed = fewest if self.optional == "all" else lens.places[:1]
             for path in needed:
                 if path != NOTHING:
                     at(root, path)
-            lacking = stated and not all(fields.values())
+            lacking = any(fields.get(path) is None for path in fewest if path != NOTHING) and stated
             values = np.array(
                 [0.0 if (one := fields.get(path)) is None else one.number() for path in lens.places]
             )

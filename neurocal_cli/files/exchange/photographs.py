@@ -47,6 +47,7 @@ _NERF = CameraKeys(
     optional="any",
     aside=_ASIDE,
 )
+_LEAST = 20.0  # px of a focal length or a principal point
 _OWN = {"fl_x", "fl_y", "cx", "cy", "w", "h", *FIVE, "k4"}
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -76,7 +77,7 @@ def _read_nerf(document: Document) -> CameraSet:
         tree["fl_x"] = 0.5 * root["w"].number() / float(np.tan(half))
     missing = [key for key in ("fl_y", "cx", "cy") if key not in tree]
     for key, value in {**tree, **(frames[0] if frames else {})}.items() if missing else ():
-        if isinstance(value, float) and key not in (*_OWN, *_ASIDE):
+        if isinstance(value, float) and value > _LEAST and key not in (*_OWN, *_ASIDE):
             raise InputError(
                 f"has no {missing[0]}, and {key[:40]!r} may be it; correct its name, or remove it"
             )
