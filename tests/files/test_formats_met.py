@@ -873,6 +873,11 @@ REFUSED: dict[str, tuple[Any, str]] = {
         {"focal_length": 35, "principal_point": [320, 240], "image_size": [640, 480]},
         "not told to be in pixels",
     ),
+    "two focal lengths": ({"K": K, **FXY, "fx": 808.5}, "K and fx, fy, cx, cy differ, and both may be meant"),
+    "two focal lengths of MATLAB": (
+        {**MATLAB, "K": [[810.5, 0, 322.3], [0, 801.25, 239.7], [0, 0, 1]]},
+        "FocalLength, PrincipalPoint and the matrix differ",
+    ),
     "two sizes": (
         {"K": K, "image_size": [640, 480], **WH, "width": 1280},
         "image_size and width, height differ",

@@ -58,6 +58,7 @@ from neurocal_cli.files.exchange.document import camera_matrix
 from neurocal_cli.files.tree_fields import Field
 
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
+_ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
 _LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
 
 
@@ -228,6 +229,13 @@ class LooseKeys:
             raise InputError(
                 f"{field.path}: its last entry must be 1, found {K[2, 2]:g}; divide the matrix by it"
             )
+        four = [self.names[name][0] for names in ENTRIES for name in names if name in self.names]
+        stated = [flat(self.root.value[key]) for key in four]
+        if field is not self.root and not side and [len(one) for one in stated] == [1] * len(ENTRIES):
+            shift = np.ravel(stated) - [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+            if np.abs(shift).max() > _ROUNDED * K.max():
+                both = f"{field.path} and {', '.join(four)}"
+                self.root.refuse(f"{both} differ, and both may be meant; remove one")
         try:
             return Intrinsics.from_matrix(K)
         except InputError as error:

@@ -36,6 +36,7 @@ _CAMERAS = ({"IntrinsicMatrix"}, _INTRINSICS, {"K", "RadialDistortion"})
 STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 _SCRIPT = re.compile(r"^\s*fc(_left)?\s*=\s*\[", re.MULTILINE).search
+_ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
 _HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -114,6 +115,10 @@ def _camera(tree: dict[str, Any]) -> Camera:
         (fx, fy), (cx, cy) = _numbers(tree, "FocalLength", 2), _numbers(tree, "PrincipalPoint", 2)
         skew = float(_numbers(tree, "Skew", 1)[0]) if "Skew" in tree else 0.0
         K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    if "FocalLength" in tree and "PrincipalPoint" in tree:
+        stated = np.array([_numbers(tree, name, 2) for name in ("FocalLength", "PrincipalPoint")])
+        if np.abs(stated - [[K[0, 0], K[1, 1]], K[:2, 2]]).max() > _ROUNDED * K.max():
+            raise InputError("FocalLength, PrincipalPoint and the matrix differ; correct the one edited")
     K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
     radial = _numbers(tree, "RadialDistortion")
     tangential = _numbers(tree, "TangentialDistortion", 2)
