@@ -73,8 +73,10 @@ def is_multiview(root: Field) -> bool:
 
 def multiview_cameras(root: Field) -> CameraSet:
     """Read the cameras; see `multiview_entries`."""
-    Ks = _rows(root["Ks"], 9).reshape(-1, 3, 3)
+    Ks = _flat(root["Ks"], 9).reshape(-1, 3, 3)
     n = len(Ks)
+    if not n:
+        root["Ks"].fail("a matrix of 3 x 3 for each camera")
     k, rvecs, Ts = (_of_each(root[key], n) for key in ("distortions", "rvecs", "Ts"))
     fisheye = np.zeros(n, dtype=bool)
     if "is_fisheye" in root:
@@ -100,28 +102,26 @@ def multiview_cameras(root: Field) -> CameraSet:
 
 def _of_each(field: Field, n: int) -> Array:
     """(n, m) numbers of each of n cameras."""
-    data = _numbers(field)
+    data = _flat(field)
     if not len(data) or len(data) % n:
         field.fail(f"numbers for each of {n} cameras")
     return data.reshape(n, -1)
 
 
-def _rows(field: Field, width: int) -> Array:
-    data = _numbers(field)
-    if not len(data) or len(data) % width:
-        field.fail(f"{width} numbers for each camera")
-    return data.reshape(-1, width)
-
-
-def _numbers(field: Field) -> Array:
-    if isinstance(field.value, dict):
-        return matrix_data(field, -1)
-    try:
-        values = np.array(field.value, dtype=float).ravel()
-    except (TypeError, ValueError):
-        field.fail("numbers")
-    if not np.isfinite(values).all():
-        field.fail("finite numbers")
+def _flat(field: Field, width: int = 1) -> Array:
+    """Numbers in nested lists of any depth, in a matrix, or in a list of matrices; a multiple of `width`."""
+    value = field.value
+    if isinstance(value, dict):
+        values = matrix_data(field, -1)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        values = np.concatenate([matrix_data(entry, width) for entry in field.items()])
+    else:
+        try:
+            values = np.array(value, dtype=float).ravel()
+        except (TypeError, ValueError):
+            field.fail("numbers")
+    if not np.isfinite(values).all() or len(values) % width:
+        field.fail(f"{width} finite numbers for each" if width > 1 else "finite numbers")
     return values
 
 
@@ -303,7 +303,7 @@ def _posed(root: Field, document: Document) -> CameraSet | None:
     for name, part in found:
         keys = LooseKeys(part, document.distortion, document.notes)
         r, t = keys.find(("rvec",)), keys.find(("tvec",))
-        R = None if r is None else from_vector(_flat(r)) if _flat(r).size == 3 else None
+        R = None if r is None or (turn := _flat(r, 3)).size != 3 else from_vector(turn)
         if "distCoef" in part and "R" in part:
             R, t = matrix_data(part["R"], 9).reshape(3, 3), keys.find(("t",))
         if R is None or t is None:
@@ -312,7 +312,7 @@ def _posed(root: Field, document: Document) -> CameraSet | None:
         cameras.append(replace(keys.camera(), name=stated if isinstance(stated, str) else name))
         keys.refuse_unread()
         note_size(cameras[-1], document)
-        poses.append(Pose(R, _flat(t)))
+        poses.append(Pose(R, _flat(t, 3)))
     return mounted(cameras, poses, "OpenCV", root.get("unit").value if isinstance(root.value, dict) else None)
 
 
@@ -413,7 +413,7 @@ def _poses(root: Field) -> dict[str, Pose]:
             root["extrinsic_parameters"].fail("six numbers for each view")
         rows = rows.reshape(-1, 6)
     elif "rvecs" in root and "tvecs" in root:
-        vectors = [_flat(root[key]).reshape(-1, 3) for key in ("rvecs", "tvecs")]
+        vectors = [_flat(root[key], 3).reshape(-1, 3) for key in ("rvecs", "tvecs")]
         if len(vectors[0]) != len(vectors[1]):
             root["tvecs"].fail("as many translations as there are rvecs")
         rows = np.hstack(vectors)
@@ -425,21 +425,6 @@ def _poses(root: Field) -> dict[str, Pose]:
     return {name: Pose(from_vector(row[:3]), row[3:]) for name, row in zip(names, rows, strict=True)}
 
 
-def _flat(field: Field) -> Array:
-    """Flat array of the numbers in nested lists of any depth, in a matrix, or in a list of matrices."""
-    if isinstance(field.value, dict):
-        return matrix_data(field, -1)
-    if isinstance(field.value, list) and field.value and isinstance(field.value[0], dict):
-        return np.concatenate([matrix_data(entry, 3) for entry in field.items()])
-    try:
-        values = np.array(field.value, dtype=float).ravel()
-    except (TypeError, ValueError):
-        field.fail("numbers")
-    if not np.isfinite(values).all() or len(values) % 3:
-        field.fail("three finite numbers for each view")
-    return values
-
-
 _ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
 
 
@@ -447,6 +432,7 @@ def _anything(document: Document) -> bool:
     return bool(document.tree) or isinstance(document.root.value, list)
 
 
+_RIG = "`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`"
 OPENCV = Format(
     "OpenCV",
     _ALL,
@@ -456,7 +442,7 @@ OPENCV = Format(
     files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
     poses=True,
     most_cameras=99,
-    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
+    rig=_RIG,
 )
 JSON = Format(
     "JSON",
@@ -466,7 +452,7 @@ JSON = Format(
     skew=True,
     poses=True,
     most_cameras=99,
-    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
+    rig=_RIG,
 )
 NPZ = Format(
     "NumPy",
@@ -476,5 +462,5 @@ NPZ = Format(
     skew=True,
     poses=True,
     most_cameras=99,
-    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
+    rig=_RIG,
 )
