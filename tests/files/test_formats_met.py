@@ -156,6 +156,12 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         [],
         S,
     ),
+    "two coefficients beside other numbers": (
+        {**FXY, "k1": -0.31, "k2": 0.12, "fps": 29.97, "square_size": 0.025, "focal_length_mm": 3.04, **WH},
+        E,
+        D4[:2],
+        S,
+    ),
     "nerfstudio beside other numbers": (
         {
             "fl_x": 800.5,

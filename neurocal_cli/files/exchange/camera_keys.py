@@ -23,7 +23,7 @@ from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
-from neurocal_cli.files.exchange.camera_names import matrix_of, may_be_distortion
+from neurocal_cli.files.exchange.camera_names import have_gap, matrix_of, may_be_distortion
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.tree_fields import Field
@@ -132,11 +132,13 @@ class CameraKeys:
             fewest = next(one for one in self.lenses if one.words == lens.words).places
             needed = lens.places if whole else ()
             if stated and not whole:  # later coefficients alone are no distortion
-                needed = fewest if self.optional == "all" else lens.places[:1]
+                all_of = self.optional == "all" or lens.ours == "fisheye"
+                needed = fewest if all_of else lens.places[:1]
             for path in needed:
                 if path != NOTHING:
                     at(root, path)
-            lacking = any(fields.get(path) is None for path in fewest if path != NOTHING) and stated
+            ours = zip(MODELS[lens.ours], lens.places, strict=True)
+            lacking = have_gap([name for name, path in ours if fields.get(path) or path == NOTHING])
             values = np.array(
                 [0.0 if (one := fields.get(path)) is None else one.number() for path in lens.places]
             )

@@ -6,6 +6,7 @@ The names are in lower-case letters and digits. The values may be numbers, matri
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -201,6 +202,12 @@ def flat(value: Any) -> list[float]:
     if isinstance(value, (list, tuple)):
         return [number for entry in value for number in flat(entry)]
     return [float(value)] if is_numbers(value) else [float("nan")]
+
+
+def have_gap(names: Collection[str]) -> bool:
+    """Whether one of k1, k2, ... is missing before another of these, or one of p1 and p2."""
+    last = max((int(name[1:]) for name in names if name[0] == "k"), default=0)
+    return not {f"k{n}" for n in range(1, last)} <= set(names) or ("p1" in names) != ("p2" in names)
 
 
 def may_be_distortion(key: str, value: Any, guess: bool, every: bool = False) -> bool:

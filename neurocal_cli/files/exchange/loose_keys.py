@@ -45,6 +45,7 @@ from neurocal_cli.files.exchange.camera_names import (
     WIDTH,
     flat,
     has_entries,
+    have_gap,
     is_four,
     is_matrix,
     is_numbers,
@@ -190,7 +191,7 @@ class LooseKeys:
         return self._coefficients(side)[0] is not None
 
     coefficients_read = False
-    lacks = False  # one of k1, k2, p1, p2, and not all of them
+    lacks = False  # a coefficient, beside others
 
     def _intrinsics(self, side: str) -> Intrinsics:
         field = self.find(ORIGINAL, side, is_matrix)
@@ -379,7 +380,7 @@ class LooseKeys:
                 values[name] = entry.number()
         if not values:
             return None, False
-        self.lacks = len({*names[:4], *values} - set(values)) > 0
+        self.lacks = have_gap(values)
         if "k4" in values and not {"p1", "p2", "k5", "k6"} & set(values):  # as in a fisheye
             return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
         full = [values.get(name, 0.0) for name in names]
