@@ -77,8 +77,7 @@ def numbers(cameras: CameraSet, poses: bool = True) -> Array:
 READ = [name for name in FORMATS if name not in ("dlt", "lensfun")]
 TEXTS = [name for name in READ if name not in ("npz", "matlab", "neurocal")]
 KEY = re.compile(rb'(?m)(?<![\w./"<])["<]?([A-Za-z_][\w.]{0,60})["\']?\s*[:=>]')
-# The third radial coefficient may be missing, and a second camera matrix is told.
-MISSED = {"k3", "Camera.k3", "K_raw", "CamMatrixOriginal"}
+MISSED = {b"Camera.k3", b"K_raw", b"CamMatrixOriginal"}  # a second camera matrix is told
 NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:[eE][-+]?\d+)?(?![\w.])")
 
 
@@ -143,9 +142,10 @@ def test_no_renamed_key_of_a_camera_is_overlooked(share: float, tmp_path: Path) 
             continue  # of any size
         before = numbers(read(files, tmp_path / "f"), poses=False)
         for name, data in files.items():
-            for key in sorted({match[1] for match in KEY.finditer(data)} - {one.encode() for one in MISSED}):
+            for key in sorted({match[1] for match in KEY.finditer(data)} - MISSED):
                 for new in (key + b"x", b"foo", b"my_" + key):
-                    if rng.random() > share:
+                    # The last coefficients may be missing, and nothing tells what another word means.
+                    if rng.random() > share or (new == b"foo" and key in (b"k2", b"k3")):
                         continue
                     place = rb"(?<![\w.])" + re.escape(key) + rb"(?=[\"']?\s*[:=>])"
                     changed = {**files, name: re.sub(place, new, data)}

@@ -205,9 +205,9 @@ def flat(value: Any) -> list[float]:
 
 
 def have_gap(names: Collection[str]) -> bool:
-    """Whether one of k1, k2, ... is missing before another of these, or one of p1 and p2."""
-    last = max((int(name[1:]) for name in names if name[0] == "k"), default=0)
-    return not {f"k{n}" for n in range(1, last)} <= set(names) or ("p1" in names) != ("p2" in names)
+    """Whether one of k1, k2, ... is missing before another of these or p1, or one of p1 and p2."""
+    last = max([2 * ("p1" in names), *(int(name[1:]) for name in names if name[0] == "k")])
+    return not {f"k{n}" for n in range(1, last + 1)} <= set(names) or ("p1" in names) != ("p2" in names)
 
 
 def may_be_distortion(key: str, value: Any, guess: bool, every: bool = False) -> bool:
