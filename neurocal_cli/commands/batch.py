@@ -142,6 +142,8 @@ def batch(
     columns = {name.lower().replace("_", "-"): value for name, value in common}
     if against is not None and os.path.dirname(os.path.realpath(against)) == folder:
         raise UsageError("--against is the summary of this folder, which is written anew; give another -o")
+    if os.path.realpath(manifest) == folder:
+        raise UsageError("-o is the folder of the data sets; give another one for the results")
     todo = [job_of(one, columns, folder) for one in read_data_sets(manifest)]
     os.makedirs(folder, exist_ok=True)
     with ExitStack() as stack:

@@ -82,7 +82,7 @@ def board(
     """  # noqa: D301 - as in the group
     ending = os.path.splitext(output)[1].lower()
     if ending not in _ENDINGS:
-        raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
+        raise UsageError(f"-o {output}: give a name that ends in {options.one_of(' '.join(_ENDINGS))}")
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
     stem, outputs = os.path.splitext(output)[0], [output]

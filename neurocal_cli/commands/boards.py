@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from math import gcd
 from typing import TYPE_CHECKING
@@ -14,7 +17,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import ProgressBar, complain, note, say, warn
-from neurocal_cli.errors import NeurocalError, UsageError
+from neurocal_cli.errors import InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,6 +32,7 @@ _UNKNOWN = "the {} is not given, so it is the unit of all lengths; give it by --
 
 _SELDOM = 0.2  # ratio of images with the described size to those with another; boards are seen in mirrors
 _COMPARED = 3  # images, with a described board with markers
+_USUAL_SIDES = 1.0, 2000.0  # mm, of squares
 _FEW = 3  # images; fewer may by chance show the same part of the board
 
 
@@ -59,6 +63,9 @@ class BoardOptions:
                 raise UsageError(
                     "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
                 )
+            if re.fullmatch(r"\d+x\d+(:[\d.]+)?", self.file) and not os.path.exists(self.file):
+                size, _, side = self.file.partition(":")
+                raise UsageError(f"--board {self.file}: give --board chessboard:{size}:{side or 'SQUARE'}")
             from neurocal_cli.files.board_yaml import read_board
 
             return read_board(self.file)
@@ -101,6 +108,17 @@ class BoardOptions:
             raise UsageError("--unit is the unit of --square, which is missing; give both")
         return 1.0, "squares"
 
+    def note_odd_side(self) -> None:
+        """Note a square that is so small or large that its unit may be another one."""
+        from neurocal_cli.observations.printed_sheet import millimetres
+
+        if self.square is None:
+            return
+        with suppress(InputError):  # a unit that is no known length
+            side, unit = self.side
+            if not _USUAL_SIDES[0] <= side * millimetres(unit) <= _USUAL_SIDES[1]:
+                note(f"the squares are {side:g} {unit} wide, as given; if they are not, add their --unit")
+
     @property
     def is_file(self) -> bool:
         """Whether the board is described by a file, not in short."""
@@ -117,11 +135,10 @@ class BoardOptions:
 
 _BOARD_FILE = (
     "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
-    "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
-    "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY, "
-    "circles:COLSxROWS:DISTANCE[:DIAMETER], "
-    "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
-    "and ROWS count squares, tags or circles; of a chessboard, inner vertices."
+    "chessboard:COLSxROWS:SQUARE, aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], "
+    "charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY, "
+    "circles:COLSxROWS:DISTANCE[:DIAMETER] (asymmetric_circles alike). COLS and ROWS count squares, tags or "
+    "circles; of a chessboard, inner vertices."
 )
 
 
@@ -158,6 +175,7 @@ def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
 def described_board(given: BoardOptions) -> Board | None:
     """The described board in its measured size; None if its size is to be found."""
     board = given.read_or_unknown()
+    given.note_odd_side()
     if board is not None and given.file is None and given.square is None:
         note(_UNKNOWN.format("side of a square"))
     if board is None or not board.distances:

@@ -6,7 +6,9 @@ Commands use them as ``@options.path(...)``, so that options with the same meani
 from __future__ import annotations
 
 import math
+import os
 import re
+import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import wraps
@@ -17,7 +19,7 @@ from click.core import ParameterSource
 from click.types import FloatParamType
 
 from neurocal_cli.commands.streams import HelpContext, note
-from neurocal_cli.errors import UsageError, plural
+from neurocal_cli.errors import FormatError, UsageError, plural
 from neurocal_cli.files.reading import detect_line
 
 if TYPE_CHECKING:
@@ -50,7 +52,12 @@ COMMON_MODELS = f"auto {_USUAL} fisheye"
 
 _OF_THE_GROUP = ("-q", "--quiet", "-v", "--verbose")
 _FEW = 10  # options that need no headings
+_MOST_PARTS = 5  # of a name with blanks
+_UNITS = ("mm", "cm", "dm", "m", "inch", "in", "px")
 _LONG_CHOICE = 40  # characters
+# What the files of outputs hold, by their endings, and endings that promise something else.
+_TEXTS = {".yaml": "YAML", ".csv": "a table", ".html": "an HTML page"}
+_NO_TEXTS = (".png", ".jpg", ".jpeg", ".svg", ".pdf", ".html", ".xlsx")
 _REST = "Options"
 # Headings of options in the help of commands that have many, and the parameters below each.
 _GROUPS = {
@@ -84,13 +91,16 @@ class Command(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse, and explain what new users mistake."""
         words = list(args)  # parsing empties args
+        _check_blanks(words)
         try:
-            return super().parse_args(ctx, args)
+            rest = super().parse_args(ctx, args)
         except click.UsageError as error:
             told = self._explained(error, words, ctx)
             if told is None:
                 raise
             raise click.UsageError(told, ctx) from None
+        self._check_files(ctx)
+        return rest
 
     def _explained(self, error: click.UsageError, words: Sequence[str], ctx: click.Context) -> str | None:
         """Where -q and -v belong, what an option needs, what to do with images; None: as click says it."""
@@ -105,9 +115,11 @@ class Command(click.Command):
             return f"{error.option_name} needs {needed}: {error.option_name} {option.metavar}."
         if isinstance(error, click.MissingParameter):
             kind = None if error.param is None else error.param.type
-            if error.param is None or not isinstance(kind, click.Choice):
+            if not isinstance(error.param, click.Option):
                 return None
-            return f"{error.param.opts[0]} is missing; choose from {', '.join(map(str, kind.choices))}."
+            if isinstance(kind, click.Choice):
+                return f"{error.param.opts[0]} is missing; choose from {', '.join(map(str, kind.choices))}."
+            return f"{error.param.opts[0]} is missing; give {error.param.opts[0]} {error.param.metavar}."
         images = _images(words) if type(error) is click.UsageError and self._reads_points() else []
         if not images:
             return None
@@ -116,6 +128,21 @@ class Command(click.Command):
             f"{some}: these are images; find the points in those of each camera first: "
             f"{detect_line(images[0])}"
         )
+
+    def _check_files(self, ctx: click.Context) -> None:
+        """Refuse folders of images instead of points, and files in front of that of their camera."""
+        usage = " ".join(metavar for metavar, _ in arguments(self)).split() or [""]
+        given = [ctx.params.get(str(one.name)) for one in self.params if isinstance(one, Argument)]
+        files = [file for one in given for file in (one if isinstance(one, tuple) else (one,)) if file]
+        if ("POINTS" in usage[0] or ".csv" in usage[0]) and "FOLDER" not in usage[0]:
+            for folder in filter(os.path.isdir, files):
+                if images := _images(sorted(os.listdir(folder))):
+                    advice = f"find its points first: {detect_line(os.path.join(folder, images[0]))}"
+                    raise FormatError(f"is a folder of images; {advice}", folder)
+        if ".yaml" in usage[0] and not any(".yaml" in word for word in usage[1:]):
+            mistaken = _images(files[:1]) or [file for file in files[:1] if file.lower().endswith(".csv")]
+            if mistaken and any(file.lower().endswith((".yaml", ".yml")) for file in files[1:]):
+                raise click.UsageError(f"{usage[0]} stands first: {ctx.command_path} {' '.join(usage)}", ctx)
 
     def _reads_points(self) -> bool:
         return any(".csv" in metavar for metavar, _ in arguments(self))
@@ -135,6 +162,21 @@ class Group(click.Group):
     """A group of such commands."""
 
     context_class = HelpContext
+
+
+def _check_blanks(words: Sequence[str]) -> None:
+    """Refuse a name with blanks that the shell took apart, and a unit behind a blank, with a UsageError."""
+    for k, word in enumerate(words):
+        unit = words[k + 1] if k + 1 < len(words) else ""
+        if unit in _UNITS and re.fullmatch(r"[\d.]+", word) and not os.path.exists(unit):
+            instead = (
+                f"{word}{unit}" if words[k - 1] == "--at" else f"{word} without a unit, or with --unit {unit}"
+            )
+            raise UsageError(f"{words[k - 1]} {word} {unit}: give {instead}")
+        for end in range(k + 2, min(k + _MOST_PARTS, len(words)) + 1):
+            name = " ".join(words[k:end])
+            if not os.path.exists(word) and os.path.exists(name):
+                raise UsageError(f"{name} has blanks in its name; put it in quotes: {shlex.quote(name)}")
 
 
 def _images(words: Iterable[str]) -> list[str]:
@@ -182,7 +224,8 @@ class FiniteNumber(FloatParamType):
         try:
             number = float(super().convert(value, param, ctx))
         except click.BadParameter:
-            self.fail(f"{value!r} is not a number; give it alone, without a unit.", param, ctx)
+            why = "give a number" if str(value).startswith("-") else "give it alone, without a unit"
+            self.fail(f"{value!r} is not a number; {why}.", param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         if self._positive and number <= 0:
@@ -194,6 +237,16 @@ class _WholeNumber(click.IntRange):
     """A whole number in a range."""
 
     name = "whole number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Read a whole number, or fail as click does."""
+        try:
+            return int(super().convert(value, param, ctx))
+        except click.BadParameter:
+            if not str(value).lstrip("+-").isdecimal():
+                raise
+            most = f"{self.min} or more" if self.max is None else f"from {self.min} to {self.max}"
+            self.fail(f"{value} is not possible; give {most}.", param, ctx)
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -309,9 +362,18 @@ points = argument(
 
 def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], F]:
     """Add ``-o``, the output; stdout by default, unless it is required."""
-    usual = {"required": True} if required else {"default": "-"}
+    usual: dict[str, Any] = {"required": True} if required else {"default": "-"}
+    ending = os.path.splitext(metavar)[1]
+
+    def check(ctx: click.Context, param: click.Parameter, name: str) -> str:
+        if ending in _TEXTS and name.lower().endswith(_NO_TEXTS) and not name.lower().endswith(ending):
+            raise click.BadParameter(
+                f"{name} would hold {_TEXTS[ending]}; give a name such as {metavar.lower()}."
+            )
+        return name
+
     without = "required" if required else "standard output"
-    return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
+    return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, callback=check, **usual)
 
 
 camera_name = click.option(

@@ -218,9 +218,8 @@ def check_plot(plot: str | None) -> None:
     if plot is None:
         return
     if not plot.lower().endswith(_PICTURES):
-        raise UsageError(
-            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
-        )
+        endings = options.one_of(" ".join(_PICTURES))
+        raise UsageError(f"--plot {plot}: not a picture file; give a name that ends in {endings}")
     check_available()
 
 

@@ -135,7 +135,7 @@ def _sides(files: Sequence[str]) -> _Paths:
     """Files of the first and of the second half of the arguments."""
     if len(files) % 2:
         raise UsageError(
-            f"there are {len(files)} files or patterns; give as many for the right camera as for the left one"
+            f"{plural(len(files), 'name')} given; give as many for the right camera as for the left"
         )
     half = len(files) // 2
     left, right = find_images(files[:half]), find_images(files[half:])

@@ -15,7 +15,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
 from types import TracebackType
@@ -41,6 +41,7 @@ _MOST_NAMED = 3  # files in a folder whose names are told
 
 _HANGING = "  "  # how much farther than its first line the rest of a wrapped line is indented
 _NARROWEST = 20  # columns; below, nothing is legible
+_ROOM = 40  # columns that a text needs beside its term
 # Blanks between a number and its unit, or the two numbers of a size, where a line is not broken.
 _UNIT = r"(?:px|mm|cm|m|s|rad|degrees|%)(?:[\s,;.:)]|$)"
 _KEPT = re.compile(rf"(?<=\d) (?={_UNIT})|(?<=\d) (?=x \d)|(?<=\d x) (?=\d)")
@@ -114,6 +115,14 @@ class _Help(click.HelpFormatter):
         fitted = "\n\n".join(self._fitted(p) if p.startswith("\b") else p for p in paragraphs)
         indent = " " * self.current_indent
         self.write(f"{click.wrap_text(fitted, self.width, indent, indent, preserve_paragraphs=True)}\n")
+
+    def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 28, col_spacing: int = 2) -> None:
+        """Write terms with their texts beside them, or below them where little room is left beside."""
+        rows = list(rows)
+        beside = min(max((len(term) for term, _ in rows), default=0), col_max) + col_spacing
+        if self.width - self.current_indent - beside < _ROOM:
+            col_max = len(2 * _HANGING)
+        super().write_dl(rows, col_max, col_spacing)
 
     def _fitted(self, paragraph: str) -> str:
         room, fitted, before = self.width - self.current_indent, list[str](), ""

@@ -251,7 +251,7 @@ def test_a_board_that_looks_the_same_turned_round_is_named(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["-o", "target.jpg"], 2, "give a name that ends in .svg, .pdf, .png"),
+        (["-o", "target.jpg"], 2, "give a name that ends in .svg, .pdf or .png"),
         (["--cols", "9", "-o", "a.pdf"], 2, "--rows is missing"),
         (["--unit", "inch", "-o", "a.pdf"], 2, "--cols and --rows and --square missing"),
         (["--paper", "B7", "-o", "a.pdf"], 2, "the paper 'B7' is not known"),

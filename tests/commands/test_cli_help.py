@@ -93,6 +93,26 @@ def test_help_fits_on_a_terminal_and_its_examples_can_still_be_pasted(
     assert pasted.split() == examples(command).replace("\\\n", " ").split()
 
 
+def pieces(text: str) -> list[str]:
+    """What is not broken: words, or their parts between hyphens."""
+    return re.split(r"\s+|(?<=-)(?=\w)", text)
+
+
+@pytest.mark.parametrize("width", [60, 80])
+@pytest.mark.parametrize(("words", "command"), COMMANDS)
+def test_help_breaks_no_word(words: list[str], command: click.Command, width: int) -> None:
+    context = command.context_class(command, info_name=" ".join(["neurocal", *words]), terminal_width=width)
+    shown = set(pieces(command.get_help(context)))
+    for option in command.params:
+        if isinstance(option, click.Option) and option.help:
+            assert set(pieces(option.help)) <= shown, option.name
+
+
+def test_help_may_also_stand_before_the_command() -> None:
+    assert run("help", "calibrate").stdout == run("calibrate", "--help").stdout
+    assert run("help").stdout == run("--help").stdout
+
+
 @pytest.mark.parametrize(("words", "command"), COMMANDS)
 def test_each_option_is_in_an_example(words: list[str], command: click.Command) -> None:
     shown = set(examples(command).split())

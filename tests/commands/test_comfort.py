@@ -121,12 +121,46 @@ def test_images_instead_of_points_are_recognised(command: str) -> None:
         (("convert", SAMPLES / "flat.csv"), 2, "--to is missing; choose from neurocal, opencv, ros,"),
         (("evaluate", SAMPLES / "flat.csv"), 1, "flat.csv -o camera.yaml"),
         (("undistort", SAMPLES / "flat.csv", "a.png", "-o", "d"), 1, "give a camera file here"),
+        (
+            ("undistort", "a.png", "camera.yaml", "-o", "d"),
+            2,
+            "CAMERA.yaml stands first: neurocal undistort",
+        ),
+        (("triangulate", "m.csv", "rig.yaml"), 2, "first: neurocal triangulate RIG.yaml MATCHES.csv"),
+        (("calibrate", SAMPLES), 1, "is a folder of images; find its points first"),
+        (("calibrate", SAMPLES / "flat.csv", "-o", "camera.png"), 2, "would hold YAML; give a name such as"),
+        (("evaluate", "camera", "camera.yaml", "--at", "1000", "mm"), 2, "--at 1000 mm: give 1000mm"),
+        (
+            ("detect", SAMPLES / "board01.png", "--square", "25", "mm"),
+            2,
+            "without a unit, or with --unit mm",
+        ),
+        (("detect", SAMPLES / "board01.png", "--board", "9x6"), 2, "give --board chessboard:9x6:SQUARE"),
+        (("detect", SAMPLES / "board01.png", "--jobs", "0"), 2, "0 is not possible; give 1 or more"),
+        (("detect", SAMPLES / "board01.png", "--watch", "-o"), 2, "'-o' is not a number; give a number"),
+        (("rectify", "rig.yaml", "left", "right"), 2, "-o is missing; give -o DIR"),
     ],
 )
 def test_a_mistake_is_told_with_what_to_do(words: tuple[object, ...], status: int, told: str) -> None:
     result = run(*words)
     assert result.exit_code == status
     assert told in result.stderr.splitlines()[-1]
+
+
+def test_a_name_that_the_shell_took_apart_is_put_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my good points.csv").write_bytes((SAMPLES / "flat.csv").read_bytes())
+    result = run("calibrate", "my", "good", "points.csv")
+    assert result.exit_code == 2
+    assert "put it in quotes: 'my good points.csv'" in result.stderr
+
+
+@pytest.mark.parametrize(("side", "told"), [("0.025", True), ("25", False)])
+def test_a_side_that_may_have_another_unit_is_noted(side: str, told: bool, tmp_path: Path) -> None:
+    words = "--cols", 9, "--rows", 6, "--square", side, "--jobs", 1, "-o", tmp_path / "points.csv"
+    assert ("squares are 0.025 mm wide" in run("detect", SAMPLES / "board01.png", *words).stderr) == told
 
 
 def test_as_many_upright_images_as_others_are_explained(tmp_path: Path) -> None:
