@@ -10,7 +10,8 @@ Everything is computed from the rig and its points, so a file can be judged like
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -47,6 +48,8 @@ from neurocal_cli.camera.geometry import Array, median
 _SCATTER = Limit(6.0, 12.0)
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the views
 _FOLDS = 5
+_NUMBER = re.compile(r"(?<![\w.])\d[\d.]*(?:e[-+]?\d+)?(?: (?:%|px|mm))?")  # in a reason, with its unit
+_MOST_DIFFERENT = 2  # numbers of reasons that are told together
 
 
 @frozen_dataclass(eq=False)
@@ -173,19 +176,47 @@ def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     given = any(camera.type != 1 for camera in rig.cameras.values())
     if not given and _SCATTER.grade(e.rest):
         yield from _frames(rig, e)
+    told = told_once(e.cameras)
     for name, verdict in e.cameras.items():
         if verdict.reasons and (rig.cameras[name].type != 1 or verdict.word == "poor"):
             advice = verdict.advice[0] if verdict.advice else ""
-            yield WORDS.index(verdict.word), f"{_named(name)}: {verdict.reasons[0]}", advice
+            yield WORDS.index(verdict.word), told[name, verdict.reasons[0]], advice
     yield from _left_out(rig)
     yield from _frames(rig, e)
     yield from _precision(rig, e)
     for name, verdict in e.cameras.items():
         # Reasons and advice come the worst first.
         for k, reason in enumerate(verdict.reasons):
-            yield (1 if k else WORDS.index(verdict.word)), f"{_named(name)}: {reason}", ""
+            yield (1 if k else WORDS.index(verdict.word)), told[name, reason], ""
         for k, advice in enumerate(verdict.advice):
             yield (1 if k else WORDS.index(verdict.word)), "", advice
+
+
+def told_once(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], str]:
+    """Each reason of a camera with its name; one that several cameras have is the same text for all of them.
+
+    The text has the numbers of the first camera, and in brackets those of the others that differ.
+    """
+    alike: dict[str, dict[str, str]] = {}
+    for name, verdict in verdicts.items():
+        for reason in verdict.reasons:
+            alike.setdefault(_NUMBER.sub("", reason), {}).setdefault(name, reason)
+    told = {(name, why): f"{_named(name)}: {why}" for name, one in verdicts.items() for why in one.reasons}
+    for reasons in alike.values():
+        numbers = {name: _NUMBER.findall(reason) for name, reason in reasons.items()}
+        first, *others = reasons
+        own = {
+            name: [one for one, before in zip(numbers[name], numbers[first], strict=True) if one != before]
+            for name in others
+        }
+        if others and max(map(len, own.values())) <= _MOST_DIFFERENT:
+            whose = "both cameras" if len(verdicts) == 2 else "all cameras"
+            if len(reasons) < len(verdicts):
+                whose = f"{', '.join([first, *others[:-1]])} and {others[-1]}"
+            besides = [f"{_named(name)}: {', '.join(differ)}" for name, differ in own.items() if differ]
+            text = f"{whose}: {reasons[first]}" + (f" ({'; '.join(besides)})" if besides else "")
+            told |= dict.fromkeys(reasons.items(), text)
+    return told
 
 
 def _named(name: str) -> str:
