@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _MOST_ARROWS = 500  # more arrows cannot be distinguished
 _MANY_DOTS = 2000  # more dots overlap, and make a large .svg file
 _MOST_BARS = 40  # greatest number of views with room for their names
+_ACROSS = 24  # letters of names that have room beside each other
 _LONGEST_ARROW = 0.04  # greatest length of an rms arrow, as a share of the image width
 _ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
 _CELLS = 6  # across and down, as in the verdict
@@ -127,7 +128,7 @@ def draw_residuals(axes: Axes, subject: Subject) -> None:
     some = "" if len(shown) == len(seen) else f", {len(shown)} of {len(seen)} points"
     style(axes, f"Residuals, {scale:,.10g} times enlarged{some}")
     set_image(axes, subject)
-    axes.set_xlabel("u [px]; arrows from observed to predicted, + centre")
+    axes.set_xlabel("u [px]; arrows from observed\nto predicted, + centre")
 
 
 def draw_scatter(axes: Axes, subject: Subject) -> None:
@@ -162,7 +163,7 @@ def draw_views(axes: Axes, subject: Subject) -> None:
     axes.set(ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
     if len(errors) <= _MOST_BARS:
         names = [plain(name[-20:]) for name in evaluation.views]
-        axes.set_xticks(np.arange(len(errors)), names, rotation=90 if len(errors) > 6 else 0)
+        axes.set_xticks(np.arange(len(errors)), names, rotation=90 if sum(map(len, names)) > _ACROSS else 0)
     else:
         axes.set_xlabel("view, in the order of the data")
     highest = np.nanmax(errors, initial=0.0)
@@ -182,7 +183,7 @@ def draw_learning(axes: Axes, subject: Subject) -> None:
     axes.semilogy(np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK)
     axes.axhline(max(network.rmse_after, _ZERO), color=ACCENT, linewidth=1.2)
     what = "iteration" if calibration.trainer == "lm" else "checkpoint"
-    axes.set(xlabel=f"{what}; the line is {network.rmse_after:.3g} px, after bundle adjustment")
+    axes.set(xlabel=f"{what}; the line is {network.rmse_after:.3g} px,\nafter bundle adjustment")
     axes.set_ylabel("rms of the network [px]")
 
 
@@ -300,7 +301,7 @@ def draw_poses(
     space.yaxis.labelpad = 6
     space.invert_zaxis()
     space.view_init(elev=22, azim=-60)
-    scale = axes.inset_axes((1.3, 0.15, 0.04, 0.7))
+    scale = axes.inset_axes((1.38, 0.15, 0.04, 0.7))
     axes.figure.colorbar(colour, cax=scale, label="rms [px]")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, ACCENT = "#1f4e79", "#c0392b"
+_TITLE = 38  # characters, for which a panel of a page has room
 
 
 def check_available() -> None:
@@ -53,9 +55,14 @@ def plain(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
+def entitle(axes: Axes, title: str) -> None:
+    """Set the title of a panel, in lines that the panels of a page have room for."""
+    axes.set_title("\n".join(textwrap.fill(line, _TITLE) for line in title.split("\n")), loc="left")
+
+
 def style(axes: Axes, title: str) -> None:
     """Set title, grid and frame of a panel."""
-    axes.set_title(title, loc="left")
+    entitle(axes, title)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

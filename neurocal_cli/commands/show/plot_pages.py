@@ -20,7 +20,7 @@ from neurocal_cli.commands.show.camera_panels import (
     panels_of,
     targets_of,
 )
-from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, entitle, picture, plain, style
 from neurocal_cli.errors import plural
 
 if TYPE_CHECKING:
@@ -34,10 +34,10 @@ _LABEL = (190.0, 24.0)  # room of a camera's name in the drawing
 # The direction of the view of the drawing: from above, and from the right.
 _VIEW = euler_to_rotation(np.radians(22.0), 0.0, 0.0) @ euler_to_rotation(0.0, np.radians(30.0), 0.0)
 _PAD = 0.12  # inches
-_PAGE = (15.0, 11.0)
+_PAGE = (7.6, 11.6)  # two columns, which are still read where a screen or a page is narrow
 _PANEL = (5.0, 4.0)  # text of 9 points is still read where the picture is 400 px wide
 _SIDES = ("left", "right")
-_ROWS = (("residuals", "coverage", "uncertainty"), ("scatter", "poses", "learning"), ("views",) * 3)
+_ROWS = (("residuals", "uncertainty"), ("coverage", "scatter"), ("poses", "learning"), ("views",) * 2)
 Draw = Callable[["Axes"], None]
 
 
@@ -152,7 +152,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
         f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
         f"{evaluation.n_points} points, {plural(len(evaluation.views), 'view')}"
     )
-    return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, title, _PAGE, kind)
+    return _page([list(row) for row in _ROWS], (1, 1, 1, 0.6), panels, title, _PAGE, kind)
 
 
 def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> bytes:
@@ -166,9 +166,11 @@ def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> 
     panels["poses"] = lambda axes: draw_poses(axes, rig.left, [(rig.right.camera, rig.pose)], _SIDES)
     if panel == "poses":
         return _alone(panel, panels[panel], kind)
-    rows = [[f"{side} {name}" for name in _ROWS[0]] for side in sides]
-    rows.append(["poses", "left views", "right views"])
-    size = _PAGE
+    rows = [
+        [f"{side} {name}" for side in sides] for name in ("residuals", "uncertainty", "coverage", "views")
+    ]
+    rows.append(["poses"] * 2)
+    size = _PAGE[0], 1.25 * _PAGE[1]
     if panel is not None:
         rows = [[f"{side} {panel}" for side in sides]]
         size = 2 * _PANEL[0], _PANEL[1]
@@ -197,7 +199,7 @@ def _with_side(side: str, draw: Draw) -> Draw:
 
     def titled(axes: Axes) -> None:
         draw(axes)
-        axes.set_title(f"{side}: {axes.get_title(loc='left')}", loc="left")
+        entitle(axes, f"{side}: {' '.join(axes.get_title(loc='left').split())}")
 
     return titled
 
@@ -220,12 +222,12 @@ def draw_points_in_space(
     }
     if panel is not None:
         return _alone(panel, panels[panel], kind)
-    rows = [["across", "depth", "poses"], ["depths", "views", "views"]]
+    rows = [["across", "depth"], ["depths", "poses"], ["views"] * 2]
     title = (
         f"{found.n_points} triangulated points: rms {found.rmse:.4g} {unit}, NSCE {found.nsce:.3g}, "
         f"epipolar rms {found.epipolar_px:.3g} px"
     )
-    return _page(rows, (1, 1), panels, title, (16.0, 9.0), kind)
+    return _page(rows, (1, 1, 0.8), panels, title, (_PAGE[0], 0.8 * _PAGE[1]), kind)
 
 
 def _page(
