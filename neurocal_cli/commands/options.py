@@ -362,18 +362,21 @@ points = argument(
 
 def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], F]:
     """Add ``-o``, the output; stdout by default, unless it is required."""
-    usual: dict[str, Any] = {"required": True} if required else {"default": "-"}
-    ending = os.path.splitext(metavar)[1]
-
-    def check(ctx: click.Context, param: click.Parameter, name: str) -> str:
-        if ending in _TEXTS and name.lower().endswith(_NO_TEXTS) and not name.lower().endswith(ending):
-            raise click.BadParameter(
-                f"{name} would hold {_TEXTS[ending]}; give a name such as {metavar.lower()}."
-            )
-        return name
-
+    usual = {"required": True} if required else {"default": "-"}
     without = "required" if required else "standard output"
-    return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, callback=check, **usual)
+    return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
+
+
+def check_ending() -> None:
+    """Refuse an output whose name promises something else than it would hold, with a UsageError."""
+    context = click.get_current_context()
+    name = str(context.params.get("output"))
+    for option in context.command.params:
+        ending = os.path.splitext(str(option.metavar))[1]
+        promises = name.lower().endswith(_NO_TEXTS) and not name.lower().endswith(ending)
+        if option.name == "output" and ending in _TEXTS and promises:
+            instead = str(option.metavar).lower()
+            raise UsageError(f"-o {name} would hold {_TEXTS[ending]}; give a name such as {instead}")
 
 
 camera_name = click.option(

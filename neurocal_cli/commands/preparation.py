@@ -53,6 +53,7 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
     if held is not None:
         held.protect(*inputs)
     check_places(*outputs)
+    options.check_ending()
 
 
 def is_for_the_eye(output: str, name: str, what: str = "the file") -> bool:
