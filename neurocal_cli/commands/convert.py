@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import boards, options, preparation
-from neurocal_cli.commands.streams import note, print_summary, say, warn
+from neurocal_cli.commands.streams import note, noted, print_summary, say, warn, warned
 from neurocal_cli.errors import FormatError, InputError, UsageError, plural
 from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
@@ -210,7 +210,6 @@ def _read(
     from neurocal_cli.files.exchange.corners import read_corners
 
     notes: list[str] = []
-    warnings: list[str] = []
     points = None
     if what != "camera" and not is_folder(files[0]):
         points = read_corners(files, board, notes, unit, what)
@@ -228,11 +227,8 @@ def _read(
         raise UsageError(f"there are {len(files)} files; give one, or the two of one rig")
     from neurocal_cli.files.exchange.reading import read_cameras
 
-    notes = []
-    cameras = read_cameras(files, notes, warnings, distortion=distortion, size=size)
-    note(*notes)
-    warn(*(warnings if size is None else ()))  # they are about the size
-    return _completed(cameras, unit, size)
+    read = warned if size is None else noted  # warnings are about the size
+    return _completed(read(read_cameras, files, distortion=distortion, size=size), unit, size)
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:

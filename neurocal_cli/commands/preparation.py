@@ -15,7 +15,7 @@ import click
 from neurocal_cli.commands import boards, options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.show.figure import check_available
-from neurocal_cli.commands.streams import ProgressBar, is_terminal, note, say, warn
+from neurocal_cli.commands.streams import ProgressBar, is_terminal, note, say, warn, warned
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back, write_whole
 
@@ -125,12 +125,7 @@ def known_camera(path: str, distortion: str | None = None) -> Camera | Calibrati
     """Read a known camera, and tell what its file leaves in doubt; see `read_given_camera`."""
     from neurocal_cli.files.exchange.reading import read_given_camera
 
-    notes: list[str] = []
-    warnings: list[str] = []
-    camera = read_given_camera(path, notes, warnings, distortion)
-    note(*notes)
-    warn(*warnings)
-    return camera
+    return warned(read_given_camera, path, distortion=distortion)
 
 
 def given_camera(

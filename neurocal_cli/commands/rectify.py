@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
+from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn, warned
 from neurocal_cli.errors import FormatError, InputError, UsageError, plural
 from neurocal_cli.files.image_files import find_images, is_image, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
@@ -114,11 +114,7 @@ def rectify(
     from neurocal_cli.calibration.rig.rectification import rectified_pair
     from neurocal_cli.files.exchange.reading import read_cameras
 
-    notes: list[str] = []
-    warnings: list[str] = []
-    found = _pair(read_cameras([rig], notes, warnings), rig, cameras)
-    note(*notes)
-    warn(*warnings)
+    found = _pair(warned(read_cameras, [rig]), rig, cameras)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note, print_summary, say, suggest, warn
+from neurocal_cli.commands.streams import note, print_summary, say, suggest, warn, warned
 from neurocal_cli.errors import source_of, value_failures
 
 if TYPE_CHECKING:
@@ -67,17 +67,14 @@ def resize(
 
     change = partial(resizing, to=to, scale=scale, crop=crop, binning=binning)
     change((10**7, 10**7))  # whether it is one of them
-    notes: list[str] = []
-    warnings: list[str] = []
-    found = read_cameras([file], notes, warnings)
+    found = warned(read_cameras, [file])
     with value_failures(source_of(file)):
         changes = [change(camera.image_size) for camera in found.cameras]
     pairs = zip(changes, found.cameras, strict=True)
     cameras = tuple(one.camera(camera) for one, camera in pairs)
     origin = None if found.origin is None else resized(found.origin, changes)
-    notes += write_result(result_of(replace(found, cameras=cameras, origin=origin)), output)
-    note(*notes)
-    warn(*warnings, *_doubts(changes[0], found.cameras[0]))
+    note(*write_result(result_of(replace(found, cameras=cameras, origin=origin)), output))
+    warn(*_doubts(changes[0], found.cameras[0]))
     if as_json:
         print_summary({"cameras": [_summary(camera) for camera in cameras]})
     else:

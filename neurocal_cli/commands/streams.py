@@ -265,6 +265,14 @@ def noted(read: Callable[..., T], *given: Any, **how: Any) -> T:
     return found
 
 
+def warned(read: Callable[..., T], *given: Any, **how: Any) -> T:
+    """The same for a function that also adds to its argument `warnings`."""
+    warnings: list[str] = []
+    found = noted(read, *given, warnings=warnings, **how)
+    warn(*warnings)
+    return found
+
+
 def note_once(remarks: Mapping[str, Sequence[str]]) -> None:
     """Report remarks, each with the first name of those that it is about, and their number."""
     for text, names in remarks.items():

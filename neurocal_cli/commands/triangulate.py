@@ -30,12 +30,6 @@ _SAMPLE = 1000  # points whose fault is looked for
 _MANY_OFF = 0.5  # share of the points that chance does not explain
 
 
-def _name(ctx: click.Context, param: click.Parameter, text: str | None) -> str | None:
-    if text == "":
-        raise click.BadParameter("the name is empty.")
-    return text
-
-
 @click.command(cls=options.Command)
 @options.argument(
     "inputs",
@@ -61,12 +55,10 @@ def _name(ctx: click.Context, param: click.Parameter, text: str | None) -> str |
     without="5 sigma",
     positive=True,
 )
-@click.option(
+@options.path(
     "--plane",
-    metavar="VIEW",
-    callback=_name,
-    show_default="none",
-    help="Of a single camera: compute points on the plane of the target of this view, such as a board that "
+    "VIEW",
+    "Of a single camera: compute points on the plane of the target of this view, such as a board that "
     "lay on a table. Give CAMERA.yaml and a CSV file with the columns u,v and optionally point.",
 )
 @options.summary

@@ -21,6 +21,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, picture, plain, say, style
+from neurocal_cli.commands.show.text import round_down
 from neurocal_cli.observations.board import planes_are_named
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
@@ -102,14 +103,6 @@ def _frame(subject: Subject) -> Array:
     return np.array([low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin])
 
 
-def _round_scale(scale: float) -> float:
-    """Round down to one of 1, 2, 5, 10, ..."""
-    if not np.isfinite(scale) or scale <= 0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(scale))
-    return float(power * max(step for step in (1.0, 2.0, 5.0) if step <= scale / power * (1 + 1e-9)))
-
-
 def draw_residuals(axes: Axes, subject: Subject) -> None:
     """Draw the residuals of all views at their points in the image, enlarged."""
     evaluation = subject.evaluation
@@ -120,7 +113,7 @@ def draw_residuals(axes: Axes, subject: Subject) -> None:
     pixels, residuals = subject.points.pixels[shown], evaluation.residuals[shown]
     spacing = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels)) if len(pixels) else 0.0
     length = min(_LONGEST_ARROW * (right - left), max(1.5 * spacing, 0.015 * (right - left)))
-    scale = _round_scale(length / max(evaluation.rmse_px, 1e-300))
+    scale = round_down(length / max(evaluation.rmse_px, 1e-300))
     axes.quiver(
         *pixels.T, *residuals.T, color=INK, angles="xy", scale_units="xy", scale=1 / scale, width=0.0025
     )

@@ -22,7 +22,7 @@ from neurocal_cli import __version__
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.text import facts
+from neurocal_cli.commands.show.text import facts, round_down
 
 _LONG = 40  # characters; longer cells are texts
 _STYLE = """
@@ -220,9 +220,7 @@ def enlargement(residuals: Array, size: tuple[int, int]) -> float:
     rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else 0.0
     if not rms > 0:
         return 1.0
-    wanted = _LONGEST * size[0] / (3 * rms)
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(power * max(m for m in (1, 2, 5) if m * power <= wanted))
+    return round_down(_LONGEST * size[0] / (3 * rms))
 
 
 def scatter(residuals: Array) -> str:

@@ -135,6 +135,14 @@ def number(value: float, form: str) -> str:
     return format(value, form) if math.isfinite(value) else "-"
 
 
+def round_down(scale: float) -> float:
+    """Round down to one of 1, 2, 5, 10, ...; 1 if there is none."""
+    if not math.isfinite(scale) or scale <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(scale))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step <= scale / power * (1 + 1e-9))
+
+
 def printable(name: str) -> str:
     """The name as printable text on one line, with other characters escaped."""
     return name if name.isprintable() else ascii(name)[1:-1]
