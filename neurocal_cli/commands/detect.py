@@ -162,7 +162,7 @@ def detect(
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
       neurocal detect sample_data/board*.png --board board.yaml --json \\
           --cache found --frames 30 --board-name left -o points.csv
-      neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
+      neurocal detect "sample_data/board*.png" --square 25 --watch 2 -o points.csv
       neurocal board --board charuco:8x6:28:21 --dpi 100 -o print.png
       neurocal detect print.png --board charuco:8x6:28:21 -o points.csv
       neurocal detect print.png --board charuco:8x6:28:21 --board-name A -o a.csv

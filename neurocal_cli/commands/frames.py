@@ -166,7 +166,11 @@ def _whole(
 
 def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) -> None:
     """Report on a new image: what is wrong with it, or the verdict so far and the view to take next."""
-    alike = of_one_size(outcomes)
+    try:
+        alike = of_one_size(outcomes)
+    except InputError as error:  # as many of two sizes, until the next image
+        complain(str(error))
+        return
     outcome = alike[path]
     if outcome.detection is None:
         complain(outcome.problem)

@@ -201,6 +201,17 @@ def test_a_folder_is_watched_until_no_more_images_come(
     assert run("detect", "-", *BOARD, "--watch", 1).exit_code == 2
 
 
+def test_the_watch_goes_on_past_as_many_images_of_another_size(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name in ("board01.png", "photo01.jpg", "photo02.jpg"):
+        (folder / name).write_bytes((SAMPLES / name).read_bytes())
+    result = run("detect", folder, *BOARD, "--watch", 0.5, "-o", tmp_path / "points.csv")
+    assert result.exit_code == 0, result.stderr
+    assert "as many have" in result.stderr
+    assert "2 of 3 images" in result.stderr
+
+
 def test_an_interrupt_ends_the_watch_and_the_points_are_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
