@@ -177,19 +177,11 @@ def calibrate(
         return replace(several, warnings=(*told, *several.warnings))
     known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
-    _check_options(method, trainer, distortion, outliers, choice, starts, seed)
-    if preferred:
-        check_choice("preferred", preferred, tuple(MODELS))
-    if skew not in (True, False, *SKEWS):
-        raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
-    if skew == "auto" and method != "neuro":
-        raise UsageError(f"skew auto needs the method neuro, but the method is {method}; give free or fixed")
+    _check_options(method, trainer, distortion, outliers, choice, starts, seed, preferred)
+    angle = _angle_of(skew, square_pixels, method, distortion)
     if fix and method != "neuro":
         raise UsageError(f"fix needs the method neuro, but the method is {method}; leave it out")
-    if square_pixels:
-        _check_square(method, distortion, skew)
-        skew = False
-    if fix and "alpha_v" in fix and skew not in (False, "fixed"):
+    if fix and "alpha_v" in fix and angle != "fixed":
         raise UsageError(
             "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
         )
@@ -198,25 +190,21 @@ def calibrate(
     if known_target is not None:
         points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)
-    known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
+    known = None if given is None else given.intrinsics
     if isinstance(extrinsics, Calibration):
-        extrinsics = {name: view.pose for name, view in extrinsics.views.items()}
-    type_3 = isinstance(type, (int, np.integer)) and type == 3
-    lens = distortion if method == "neuro" or type_3 else _distortion_of(method, distortion)
-    if not type_3:
-        model = Distortion() if lens in _FOUND else Distortion(lens)
-    elif lens not in ("auto", "none", model.model):
-        raise UsageError(
-            f"type 3 uses the distortion of the given camera ({model.model}), not {lens}; leave it out"
-        )
-    way = lens if lens in _FOUND and not type_3 else ""
+        poses: Mapping[str, Pose] | None = {name: view.pose for name, view in extrinsics.views.items()}
+    else:
+        poses = extrinsics
+    model, way = _lens_of(type, method, distortion, given)
     options = options_for(
         trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
     )
+
+    def stated(with_skew: bool) -> Problem:
+        return problem_for(points, type, image_center, known, poses, with_skew, model, fix, square_pixels)
+
     try:
-        problem = problem_for(
-            points, type, image_center, known, extrinsics, skew in (True, "free"), model, fix, square_pixels
-        )
+        problem = stated(angle == "free")
         if method != "neuro":
             from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
 
@@ -225,9 +213,8 @@ def calibrate(
             warnings = _unused(points, f"the method is {method}")
         else:
             solution, rejected = _solved(problem, options, outliers, choice)
-            if skew == "auto" and not type_3 and shows_skew(solution):
-                skewed = problem_for(points, type, image_center, known, extrinsics, True, model, fix)
-                solution, rejected = _solved(skewed, options, outliers, choice)
+            if angle == "auto" and problem.free_camera.any() and shows_skew(solution):
+                solution, rejected = _solved(stated(True), options, outliers, choice)
             if known_target is not None:
                 solution = replace(solution, target=known_target)
             if solution.refusal:
@@ -237,24 +224,32 @@ def calibrate(
             )
             _refuse_misfit(found)
             warnings = _about_target(found, solution, choice)
-        if isinstance(intrinsics, Calibration):
-            found = with_given_covariance(found, intrinsics)
-        if isinstance(intrinsics, (Camera, Calibration)) and (why := undistorted_before(points, intrinsics)):
-            warnings = (*warnings, why)
-        return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
     except DegenerateGeometryError as error:
-        text, copies = _true_cause(points, type) or str(error), repeated_views(points)
-        if copies:
-            text += (
-                f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "
-                "or in another one"
-            )
-        # The code that raised this does not know the points' file, so its name is added here.
-        if points.lines is not None and not text.startswith(points.source):
-            text = f"{points.source}: {text}"
-        if text == str(error):
+        explained = _explained(error, points, type)
+        if explained == str(error):
             raise
-        raise DegenerateGeometryError(text) from error
+        raise DegenerateGeometryError(explained) from error
+    if isinstance(intrinsics, Calibration):
+        found = with_given_covariance(found, intrinsics)
+    if isinstance(intrinsics, (Camera, Calibration)) and (why := undistorted_before(points, intrinsics)):
+        warnings = (*warnings, why)
+    return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
+
+
+def _explained(error: DegenerateGeometryError, points: Correspondences, type: int) -> str:
+    """A refusal with its true cause, the views that are given twice, and the points' file.
+
+    The code that raised it does not know these.
+    """
+    text, copies = _true_cause(points, type) or str(error), repeated_views(points)
+    if copies:
+        text += (
+            f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "
+            "or in another one"
+        )
+    if points.lines is not None and not text.startswith(points.source):
+        text = f"{points.source}: {text}"
+    return text
 
 
 def _true_cause(points: Correspondences, type: int) -> str:
@@ -273,14 +268,21 @@ def _true_cause(points: Correspondences, type: int) -> str:
     return "" if found is None else f"{unlike_axes(found)}; {MEASURE_AXES}"
 
 
-def _check_square(method: str, distortion: str, skew: bool | str) -> None:
-    """Refuse options that do not go with square pixels."""
+def _angle_of(skew: bool | str, square_pixels: bool, method: str, distortion: str) -> str:
+    """Whether the angle of the axes is "free", "fixed", or found to be one of them ("auto")."""
+    if skew not in (True, False, *SKEWS):
+        raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
+    if skew == "auto" and method != "neuro":
+        raise UsageError(f"skew auto needs the method neuro, but the method is {method}; give free or fixed")
+    if not square_pixels:
+        return "auto" if skew == "auto" else "free" if skew in (True, "free") else "fixed"
     if method != "neuro":
         raise UsageError(f"square_pixels needs the method neuro, but the method is {method}; leave it out")
     if distortion == "plumb-line":
         raise UsageError("square_pixels does not go with the distortion plumb-line; name k1k2p1p2 instead")
     if skew in ("free", "auto"):
         raise UsageError(f"square pixels have right angles, but skew is {skew}; leave it out")
+    return "fixed"
 
 
 def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
@@ -316,13 +318,21 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
     return with_given_covariance(found, camera) if isinstance(camera, Calibration) else found
 
 
-def _distortion_of(method: str, distortion: str) -> str:
-    """The distortion model for a method other than neuro."""
-    if distortion in ("plumb-line", "rich"):
+def _lens_of(type: int, method: str, distortion: str, given: Camera | None) -> tuple[Distortion, str]:
+    """The distortion that the problem states, and "auto" or "plumb-line" if its model is to be found."""
+    if isinstance(type, (int, np.integer)) and type == 3:
+        known = given.distortion if given else Distortion()
+        if distortion not in ("auto", "none", known.model):
+            raise UsageError(
+                f"type 3 uses the distortion of the given camera ({known.model}), not {distortion}; "
+                "leave it out"
+            )
+        return known, ""
+    if method != "neuro" and distortion in ("plumb-line", "rich"):
         raise UsageError(f"distortion {distortion} needs the method neuro, but the method is {method}")
-    if distortion == "auto":
-        return "k1" if method == "tsai" else "none"
-    return distortion
+    if method != "neuro" and distortion == "auto":
+        distortion = "k1" if method == "tsai" else "none"
+    return (Distortion(), distortion) if distortion in _FOUND else (Distortion(distortion), "")
 
 
 def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[str, ...]:
@@ -361,7 +371,14 @@ def _refuse_misfit(calibration: Calibration) -> None:
 
 
 def _check_options(
-    method: str, trainer: str, distortion: str, outliers: str, target: str, starts: int, seed: int
+    method: str,
+    trainer: str,
+    distortion: str,
+    outliers: str,
+    target: str,
+    starts: int,
+    seed: int,
+    preferred: str,
 ) -> None:
     check_choice("method", method, METHODS)
     check_choice("trainer", trainer, TRAINERS)
@@ -373,3 +390,5 @@ def _check_options(
     if not isinstance(starts, (int, np.integer)) or starts < 2:
         raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     check_seed(seed)
+    if preferred:
+        check_choice("preferred", preferred, tuple(MODELS))
