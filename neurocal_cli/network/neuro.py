@@ -7,7 +7,7 @@
    (`adjustment.adjust`), also from other starts if another minimum may be lower (`local_minima`).
 
 No stage needs an initial guess. Views with too few points for a free network, and cameras that a free network
-does not determine, start from random cameras instead (`random_cameras`). In type 4 V is given, so all views
+does not determine, start from random cameras instead (`starts`). In type 4 V is given, so all views
 together train a single layer, W, with known inputs.
 """
 

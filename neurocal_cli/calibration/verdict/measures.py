@@ -68,7 +68,7 @@ def projection_uncertainty(
     """Propagate the covariance of a calibration to projected pixels (G, 2) [px] at depths (D,).
 
     The minimum is normalised, the camera is the same in pixels, and `variance` is that of the residuals,
-    normalised. `shared` (f, f) is the covariance of the free entries and coefficients (`view_covariance`).
+    normalised. `shared` (f, f) is the covariance of the free entries and coefficients (`covariance`).
     Pixels of a wide lens that are much farther out than the angle [rad] of the `farthest` point lie beyond
     its image circle.
     """

@@ -1,7 +1,7 @@
 """The target that all settings of a zoom lens share, found from some of them together.
 
 Each of these settings is calibrated by itself; then the offsets of the target's points are found with all of
-these cameras (`calibration.common_target`). The lens is fitted to the target that was found.
+these cameras (`target_choice.common_target`). The lens is fitted to the target that was found.
 
 The offsets d of the target's points are common to all settings. With B_s = J_c^T J_d of a setting's local and
 shared parameters (poses eliminated), the weights w of the networks have the covariance
