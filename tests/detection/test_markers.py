@@ -184,6 +184,28 @@ def test_the_light_of_a_pattern_is_that_of_the_blurred_pattern() -> None:
     np.testing.assert_allclose(light[0], blurred[np.ix_(at, at)].ravel(), atol=0.01)
 
 
+@pytest.mark.parametrize(("row", "width"), [(3, 55), (3, 45), (2, 55)])
+def test_a_line_of_vertices_is_refused(row: int, width: int) -> None:
+    scene = marked_scene(plane_of("charuco:6x5:40:30:DICT_4X4_50"), 3, square=32.0, tilt=0.0)
+    picture = taken(scene, 3, 4)
+    first, last = picture.truth.planes[0].vertices[row, [0, -1]]
+    ends = [
+        (end + beyond).astype(int).tolist() for end, beyond in ((first, first - last), (last, last - first))
+    ]
+    shown = cv2.line(np.zeros(picture.image.shape, np.uint8), ends[0], ends[1], (1,), width)
+    with pytest.raises(NoBoardError):
+        detect_points(np.where(shown > 0, picture.image, np.uint8(120)), scene.board)
+
+
+def test_two_lines_of_vertices_are_measured() -> None:
+    scene = marked_scene(plane_of("aprilgrid:4x3:40:0.3"), 59, square=34.0, tilt=40.0)
+    picture = taken(scene, 59, 4)
+    found = detect_points(np.ascontiguousarray(picture.image[63:161, 144:260]), scene.board)
+    error, _ = errors_of(replace(found, pixels=found.pixels + np.array([144, 63])), picture)
+    assert len(error) >= 8
+    assert np.abs(error).max() < 0.3
+
+
 def test_only_ink_beside_found_vertices_is_taken_off() -> None:
     cell = np.array([[-1, -1], [0, 0], [1, 1], [2, 2], [9, 9]])
     ink = Ink(cell, np.array([0.2, 0.8]), np.ones((5, 1, 1)), -np.ones(5))

@@ -307,7 +307,11 @@ def polynomials(degree: int, frame: Frame, x: Array, y: Array) -> Array:
     for _ in range(degree - 1):
         tx.append(2 * x * tx[-1] - tx[-2])
         ty.append(2 * y * ty[-1] - ty[-2])
-    return np.stack([tx[i] * ty[j] for i, j in polynomial_orders(degree, frame)], axis=-1)
+    orders = polynomial_orders(degree, frame)  # none for a board of two lines
+    values = np.empty((*x.shape, len(orders)))
+    for k, (i, j) in enumerate(orders):
+        values[..., k] = tx[i] * ty[j]
+    return values
 
 
 _DEGREE = 4

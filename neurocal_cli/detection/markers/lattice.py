@@ -136,7 +136,8 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
         # Vertices that were too far from the markers may be near the new ones.
         corners, pixels = ground[seen], found[seen]
     seen = np.isfinite(found[..., 0])
-    if seen.sum() < _FEWEST:
+    # Vertices of one line and a single other one do not tell how the board lies.
+    if seen.sum() < _FEWEST or seen.sum() - max(seen.sum(axis=0).max(), seen.sum(axis=1).max()) < 2:
         return None
     rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     first = int(cols[0]), int(rows[0])
