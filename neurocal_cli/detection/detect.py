@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import nearly_elliptic
+from neurocal_cli.detection.circles.lattice import fitted_ellipses, nearly_elliptic
 from neurocal_cli.detection.circles.measuring import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grey import grey_image, negative
@@ -283,6 +283,9 @@ def other_target(grey: NDArray[np.generic]) -> str:
 
 def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
     """Reduce a large image, to 8 bits as well."""
+    while max(grey.shape) >= 2 * _LONGEST:  # exact halves are fast
+        even = np.ascontiguousarray(grey[: len(grey) // 2 * 2, : grey.shape[1] // 2 * 2])
+        grey = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     scale = min(1.0, _LONGEST / max(grey.shape))
     if scale < 1:
         size = [max(1, round(scale * length)) for length in grey.shape[::-1]]
@@ -341,17 +344,11 @@ def _matched(found: NDArray[np.float64], others: NDArray[np.float64], near: floa
 def _ellipses(image: NDArray[np.uint8], level: float) -> NDArray[np.float64]:
     """(n, 3) centres and areas of the dark ellipses of about the median size."""
     outlines, _ = cv2.findContours((image < level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    found = []
-    long = [np.asarray(outline)[:, 0] for outline in outlines if len(outline) >= _OUTLINE]
-    for outline in nearly_elliptic(long):
-        (x, y), (a, b), turn = cv2.fitEllipse(outline)
-        if not min(a, b) > 0:
-            continue
-        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-        across, along = ((outline - [x, y]) @ np.array([[c, -s], [s, c]]) / [a / 2, b / 2]).T
-        radius = np.hypot(across, along)
-        if np.abs(radius.mean() - 1) < _ELLIPTIC and radius.std() < _ELLIPTIC:
-            found.append((x, y, cv2.contourArea(outline)))
-    ellipses = np.array(found).reshape(-1, 3)
+    long = nearly_elliptic([np.asarray(outline)[:, 0] for outline in outlines if len(outline) >= _OUTLINE])
+    if not long:
+        return np.zeros((0, 3))
+    centre, _, away = fitted_ellipses(long)
+    good = np.flatnonzero(away < _ELLIPTIC)
+    ellipses = np.column_stack([centre[good], [cv2.contourArea(long[k]) for k in good]])
     usual = np.median(ellipses[:, 2]) if len(ellipses) else 0.0
     return ellipses[np.abs(np.log(np.maximum(ellipses[:, 2], 1e-9) / max(usual, 1e-9))) < _ALIKE]

@@ -81,9 +81,25 @@ def _ellipses(outlines: list[NDArray[Any]], image: NDArray[Any]) -> Array:
     outlines = nearly_elliptic(outlines)
     if not outlines:
         return np.zeros((0, 3))
+    centre, axes, away = fitted_ellipses(outlines)
+    low, high = axes.min(axis=1), axes.max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        good = (low > _THIN * high) & (away <= _ROUND + _ROUND_PX / low)
+    area = np.pi * (axes + 1).prod(axis=1) / 4  # the outline runs through the outermost dark pixels
+    # An arc does not enclose what its ellipse does.
+    share = np.array([cv2.contourArea(one) + len(one) / 2 for one in outlines]) / area
+    good &= (share > 0.7) & (share < 1.3)
+    kept = [k for k in np.flatnonzero(good) if _is_darker(outlines[k], centre[k], image)]
+    return np.column_stack([area, centre])[kept]
+
+
+def fitted_ellipses(outlines: list[NDArray[Any]]) -> tuple[Array, Array, Array]:
+    """Centres (n, 2) and axes (n, 2) [px] of ellipses through outlines, and how far (n,) these are from them.
+
+    That is the standard deviation over the radius or, if it is larger, the mean.
+    """
     fitted = np.array([(*at, *axes, turn) for at, axes, turn in map(cv2.fitEllipse, outlines)])
     centre, axes, turn = fitted[:, :2], fitted[:, 2:4], np.radians(fitted[:, 4:])
-    low, high = axes.min(axis=1), axes.max(axis=1)
     of, points = _joined(outlines)
     away = points - centre[of]
     along = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)[of]
@@ -91,13 +107,7 @@ def _ellipses(outlines: list[NDArray[Any]], image: NDArray[Any]) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         radius = np.hypot(*(2 * (away * x).sum(axis=1) / axes[of, k] for k, x in enumerate((along, across))))
         mean, spread = _mean_and_spread(of, radius)
-        good = (low > _THIN * high) & (np.maximum(np.abs(mean - 1), spread) <= _ROUND + _ROUND_PX / low)
-    area = np.pi * (axes + 1).prod(axis=1) / 4  # the outline runs through the outermost dark pixels
-    # An arc does not enclose what its ellipse does.
-    share = np.array([cv2.contourArea(one) + len(one) / 2 for one in outlines]) / area
-    good &= (share > 0.7) & (share < 1.3)
-    kept = [k for k in np.flatnonzero(good) if _is_darker(outlines[k], centre[k], image)]
-    return np.column_stack([area, centre])[kept]
+    return centre, axes, np.maximum(np.abs(mean - 1), spread)
 
 
 def nearly_elliptic(outlines: list[NDArray[Any]]) -> list[NDArray[Any]]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -36,14 +37,15 @@ from neurocal_cli.detection.finding.overlaps import (
     split_at_folds,
     trim_overlaps,
 )
-from neurocal_cli.detection.finding.saddles import Level, interpolate, levels_of, pyramid
+from neurocal_cli.detection.finding.saddles import Level, dense_parts, interpolate, levels_of, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
 
 Size = tuple[int, int]
 
 # Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless nothing
-# has been found yet. Chosen for speed: test_detection_speed.py.
+# has been found yet: then they are searched where they may show small squares. Chosen for speed:
+# test_detection_speed.py.
 _SEARCHED = 1.4e6
 # Larger levels are never searched, to save memory and time.
 _MOST_SEARCHED = 30_000_000
@@ -82,23 +84,25 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
     bent: list[Lattice] = []
     links: Links | None = None
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
+    coarser = {level.scale: coarse for level, coarse in pairwise(levels)}
     for level in reversed(levels):
         # On the next finer level, pixels have twice the coordinates.
         lattices, bent = ([replace(x, pixels=2 * x.pixels) for x in part] for part in (lattices, bent))
         lattices = [refined(level, x, x.derivative_sigma, 2) for x in lattices]
         bent = [refined(level, x, local_sigma(x), 2) for x in bent]
-        none = not lattices and not bent
-        if level in small or (none and level.image.size <= _MOST_SEARCHED):
+        if level not in small and not lattices and not bent and level.image.size <= _MOST_SEARCHED:
+            lattices = _split_planes(level, _find_small(level, coarser[level.scale], wanted))
+        elif level in small:
             if level is small[0]:
                 lattices = [y for x in lattices for y in _boards(remove_outliers(level, grow(level, x)))]
             links = find_links(level, _mask(level, lattices) if lattices else None)
             masked = sum(int(x.seen.sum()) for x in lattices)
             if links is not None:
                 lattices += _find_new(level, links, lattices, wanted)
-            if level not in small[1:]:
+            if level is small[0]:
                 lattices = _split_planes(level, lattices)
-            if level is small[0] and not (straight or _nearest_whole(lattices, wanted)):
-                lattices, bent = _find_bent(level, links, masked, lattices, wanted)
+                if not (straight or _nearest_whole(lattices, wanted)):
+                    lattices, bent = _find_bent(level, links, masked, lattices, wanted)
     if links is not None and not lattices and not bent and levels[0] in small:
         lattices = _split_planes(levels[0], _find_slivers(levels[0], links))
     return lattices + bent
@@ -147,6 +151,17 @@ def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
         for x in merge_lattices(drop_duplicates(result))
     )
     return [x for x in filled if has_block(x)]
+
+
+def _find_small(level: Level, coarse: Level, wanted: frozenset[Size]) -> list[Lattice]:
+    """Find grids whose squares are too small for the next coarser level, where it has many saddle points."""
+    found = []
+    for rows, columns in dense_parts(coarse):
+        part = Level(np.ascontiguousarray(level.image[rows, columns]), level.scale, level)
+        links = find_links(part)
+        new = [] if links is None else _find_new(part, links, [], wanted)
+        found += [replace(x, pixels=x.pixels + np.array([columns.start, rows.start])) for x in new]
+    return found
 
 
 def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size]) -> list[Lattice]:

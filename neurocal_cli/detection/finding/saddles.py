@@ -23,8 +23,8 @@ Image = NDArray[np.float32]
 # _SMOOTHING, _SMALLEST and _LEAST_NOISE are insensitive; the others bound memory.
 _SMOOTHING = 1.0  # px; reduces noise and aliasing
 _SMALLEST = 100  # px; shorter side of the smallest level
-_LARGE = 30_000_000  # pixels; in larger images the noise is measured only in bands, to save memory ...
-_BANDS, _ROWS_OF_BAND = 24, 64  # ... number of bands, and rows of a band
+_LARGE = 2_000_000  # pixels; in larger images the noise is measured only in bands ...
+_BANDS, _ROWS_OF_BAND = 24, 24  # ... to save time and memory: number of bands, and rows of a band
 _ROWS = 32000  # rows per call of cv2.remap, which counts them in 16 bits
 _LEAST_NOISE = 0.12  # DN/px^2; caused by rounding to 8 bits
 
@@ -44,6 +44,10 @@ _NARROWEST = np.radians(14)  # least angle between the two lines
 _PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400
 _LONGEST_STEP = 1.5  # px; insensitive, test_finding.py
 
+# Parts that may have small squares: side of the neighbourhood of a saddle point [px], least number of them in
+# it, and what is added around [px].
+_NEIGHBOURHOOD, _NEIGHBOURS, _ROOM = 19, 9, 49
+
 _ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _NEXT = (np.arange(_RAYS) + 1) % _RAYS
@@ -55,6 +59,7 @@ class Level:
 
     image: Image  # (height, width), in grey levels of an 8-bit image
     scale: int  # size of a pixel in pixels of the original
+    whole: Level | None = None  # the level of which this is a part
 
     @cached_property
     def smooth(self) -> Image:
@@ -73,6 +78,8 @@ class Level:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the second derivatives due to noise [DN/px^2], from their median."""
+        if self.whole is not None:
+            return self.whole.noise  # that of a part is hidden by its edges
         if self.image.size <= _LARGE:
             sparse = self.curvature[1][::4, ::4]
         else:
@@ -151,6 +158,25 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     kept = np.flatnonzero(good | good_small)
     kept = kept[np.argsort(-contrast[kept], kind="stable")[:_MOST]]
     return Saddles(points[kept], ports[kept], contrast[kept])
+
+
+def dense_parts(coarse: Level) -> list[tuple[slice, slice]]:
+    """Rows and columns of the parts of the next finer level that may show squares too small for this one.
+
+    Saddle points are steep on both levels if squares have 3 px on the coarser one, but only on the finer one
+    the directions of their edges can be measured. Around an inner vertex of 3 x 3, the others are near.
+    """
+    u, v = _steepest_pixels(coarse, None).astype(np.intp).T
+    steep = np.zeros(coarse.image.shape, dtype=np.uint8)
+    steep[v, u] = 1
+    near = cv2.boxFilter(steep, cv2.CV_16U, (_NEIGHBOURHOOD,) * 2, normalize=False)
+    dense = steep * (near >= _NEIGHBOURS)
+    wide = cv2.dilate(dense, np.ones((_ROOM,) * 2, dtype=np.uint8))
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(wide)
+    return [
+        (slice(2 * top, 2 * (top + high)), slice(2 * left, 2 * (left + broad)))
+        for left, top, broad, high, _ in boxes[1:].tolist()
+    ]
 
 
 def _steepest_pixels(level: Level, covered: NDArray[np.uint8] | None) -> Array:
