@@ -139,7 +139,8 @@ class Pose:
         R, t = np.array(real_array("R", self.R)), np.array(real_array("t", self.t)).ravel()
         if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
             raise InputError("a pose needs a finite 3 x 3 rotation R and 3 numbers t")
-        if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        large = np.abs(R).max() > 2.0  # whose product may overflow
+        if large or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
             raise InputError("R is not a rotation: R R^T must be the identity and det R = +1")
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-14:
             R = nearest_rotation(R)

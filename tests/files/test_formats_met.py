@@ -884,6 +884,12 @@ REFUSED: dict[str, tuple[Any, str]] = {
         {**MATLAB, "K": [[810.5, 0, 322.3], [0, 801.25, 239.7], [0, 0, 1]]},
         "FocalLength, PrincipalPoint and the matrix differ",
     ),
+    "a focal length that is no number": ({"f": "800.5-", "cx": 321.3, "cy": 238.7}, "f must be a number"),
+    "an unknown focal length": ({"f": None, "cx": 321.3, "cy": 238.7}, "has no focal length"),
+    "four numbers that are none": (
+        {"K": K, "lens": [float("nan"), float("inf"), 1, 2]},
+        "'lens' may be the distortion",
+    ),
     "two sizes": (
         {"K": K, "image_size": [640, 480], **WH, "width": 1280},
         "image_size and width, height differ",

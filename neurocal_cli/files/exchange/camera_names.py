@@ -228,7 +228,7 @@ def may_be_distortion(key: str, value: Any, guess: bool, every: bool = False) ->
         return False
     if isinstance(value, (list, dict)):
         listed = guess and len(numbers) in _LENGTHS and not _NO_LIST.search(name)
-        suspect = _SUSPECT.search(name) is not None or (listed and any(n != int(n) for n in numbers))
+        suspect = _SUSPECT.search(name) is not None or (listed and any(n % 1 != 0 for n in numbers))
         suspect = suspect or (name in ("k", "p") and len(numbers) <= _MOST_OF_ONE)
     else:
         word = _SUSPECT_WORD.search(key) is not None or every

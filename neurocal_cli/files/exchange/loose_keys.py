@@ -248,7 +248,11 @@ class LooseKeys:
         four = [entry.number() for entry in found if entry is not None]
         if len(four) < 4:
             focal, centre = (self.find(names, "", is_numbers) for names in (FOCAL, CENTRE))
-            assert focal is not None  # `has_entries`
+            if focal is None:
+                stated = self.find(FOCAL)
+                if stated is None:
+                    self.root.refuse("has no focal length")
+                stated.fail("a number")
             own = four[-2:] if centre is None else flat(centre.value)
             four = [*(2 * flat(focal.value))[:2], *own]
             size = self.image_size()
