@@ -183,7 +183,7 @@ _ALICEVISION = CameraKeys(
 
 
 def _read_alicevision(document: Document) -> CameraSet:
-    version = document.root["version"].array(3).astype(int).tolist()
+    version = document.root["version"].array(3).tolist()
     cameras: dict[str, Camera] = {}
     for entry in document.root["intrinsics"].items():
         size = int(entry["width"].number()), int(entry["height"].number())
