@@ -91,7 +91,10 @@ class Intrinsics:
         A = real_array("a camera matrix", A)
         if A.shape != (3, 3) or not np.isfinite(A).all() or A[2, 2] == 0:
             raise InputError("a camera matrix must be 3 x 3, finite, with A[2, 2] = 1")
-        A = A / A[2, 2]
+        with np.errstate(over="ignore"):  # refused below
+            A = A / A[2, 2]
+        if not np.isfinite(A).all():
+            raise InputError("a camera matrix must be 3 x 3, finite, with A[2, 2] = 1")
         if np.abs(A[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 * np.abs(A).max():
             raise InputError("a camera matrix must be upper triangular")
         theta = float(np.arctan2(A[0, 0], -A[0, 1])) if A[0, 1] != 0 else np.pi / 2

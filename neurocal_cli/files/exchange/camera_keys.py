@@ -76,6 +76,8 @@ class CameraKeys:
             if len(entries) not in (4, 9):
                 values[0].fail("four numbers or a 3 x 3 matrix")
             K = matrix_of(*entries) if len(entries) == 4 else entries.reshape(3, 3).copy()
+            if not np.array_equal(K[2], [0, 0, 1]):
+                values[0].fail("a 3 x 3 matrix whose last row is 0, 0, 1")
         else:
             K = matrix_of(*(value.number() for value in values))
         if self.skew and (skew := find(root, self.skew)) is not None:
