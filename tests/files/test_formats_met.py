@@ -1107,6 +1107,12 @@ def test_the_pose_behind_glass_and_a_lack_of_pixels_are_told(tmp_path: Path) -> 
         read_cameras([place])
 
 
+def test_a_principal_point_from_the_middle_is_told(tmp_path: Path) -> None:
+    warnings: list[str] = []
+    read_cameras([written({**FXY, "cx": 1.8, "cy": -0.8, **WH}, tmp_path)], warnings=warnings)
+    assert "(1.8, -0.8) is in the corner of an image of 640 x 480; if it is counted from" in warnings[0]
+
+
 def test_another_camera_matrix_is_told(tmp_path: Path) -> None:
     notes: list[str] = []
     check(

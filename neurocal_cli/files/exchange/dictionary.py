@@ -188,8 +188,8 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
 
 
 _DEEPEST = 4  # mappings within each other
-# Share of the image's side by which the principal point is far from the middle, and far outside the image.
-_OFF, _OUTSIDE = 0.2, 1.0
+# Shares of the image's side by which the principal point is far from the middle, far outside, or in a corner.
+_OFF, _OUTSIDE, _CORNER = 0.2, 1.0, 0.1
 _SHORTEST, _SHORT = 3.0, 0.02  # focal lengths that no camera has, in px and as a share of the image's width
 _SIDES = (
     ("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"), ("cam0", "cam1"), ("cam1", "cam2"),
@@ -277,6 +277,11 @@ def note_size(camera: Camera, document: Document) -> None:
         document.warnings.append(
             f"{place} is far from the middle of an image of {width} x {height}, and near that of {height} x "
             f"{width}; if the file has height and width, convert it with --image-size {height} {width}"
+        )
+    elif max(abs(u0) / width, abs(v0) / height) < _CORNER:
+        document.warnings.append(
+            f"{place} is in the corner of an image of {width} x {height}; if it is counted from the middle, "
+            "as in photogrammetry, add half of the size"
         )
     elif off(width, height) > _OUTSIDE:
         document.warnings.append(
