@@ -890,6 +890,17 @@ REFUSED: dict[str, tuple[Any, str]] = {
         {"K": K, "lens": [float("nan"), float("inf"), 1, 2]},
         "'lens' may be the distortion",
     ),
+    "numbered coefficients": (
+        {"K": K, "radial_distortion_1": -0.3, "radial_distortion_2": 0.1},
+        "'radial_distortion_1' may be the distortion",
+    ),
+    "kappa": ({"K": K, "kappa1": -0.3}, "'kappa1' may be the distortion"),
+    "an inverse distortion alone": ({"K": K, "undistortion_coefficients": D5}, "may be the distortion"),
+    "a division model": (
+        {"model": "division", "K": K, "strength": -1e-7},
+        "'strength' may be the distortion",
+    ),
+    "mm of a sensor": ({"fx": 4.1, "fy": 4.1, "cx": 3.2, "cy": 2.4}, "is not in pixels, but in mm"),
     "two sizes": (
         {"K": K, "image_size": [640, 480], **WH, "width": 1280},
         "image_size and width, height differ",

@@ -100,6 +100,8 @@ _SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")  # of the plain name, whole
 _SUSPECT_WORD = re.compile(  # of the name as it is
     r"(?:^|[\W_])[kp]{1,2}_?[1-6][a-z]?(?:[\W_]|$)|^(?:alpha|beta)$", re.IGNORECASE
 )
+_SUSPECT_SCALAR = re.compile(r"(?:radial|tangential|distortion|coef)\w*\d$|^kappa\d?$|^lambda$")  # plain
+_INVERSE = re.compile(r"^undistortion(?:coef\w*|param\w*)?$|^invdist|^inversedist")  # plain
 HARMLESS = re.compile(
     r"std|err|undist|newcam|uncert|sigma|limit|rms|perview|roi|optimal|thresh|flag|aspect|fix|rect|^est|valid"
     r"|prior"
@@ -216,7 +218,8 @@ def may_be_distortion(key: str, value: Any, guess: bool, every: bool = False) ->
     If `guess`, a list of as many numbers as there are coefficients has any name; if `every`, each number has.
     """
     name = plain(key)
-    if HARMLESS.search(name):
+    inverse = guess and _INVERSE.search(name) is not None
+    if HARMLESS.search(name) and not inverse:
         return False
     if isinstance(value, str) and not is_numbers(value):
         numbers, value = [1.0] * (len(value) >= _LONG and " " not in value), []
@@ -229,8 +232,8 @@ def may_be_distortion(key: str, value: Any, guess: bool, every: bool = False) ->
     if isinstance(value, (list, dict)):
         listed = guess and len(numbers) in _LENGTHS and not _NO_LIST.search(name)
         suspect = _SUSPECT.search(name) is not None or (listed and any(n % 1 != 0 for n in numbers))
-        suspect = suspect or (name in ("k", "p") and len(numbers) <= _MOST_OF_ONE)
+        suspect = suspect or inverse or (name in ("k", "p") and len(numbers) <= _MOST_OF_ONE)
     else:
-        word = _SUSPECT_WORD.search(key) is not None or every
-        suspect = _SUSPECT_NUMBER.fullmatch(name) is not None or (word and numbers[0] % 1 != 0)
+        word = every or _SUSPECT_WORD.search(key) or _SUSPECT_SCALAR.search(name)
+        suspect = _SUSPECT_NUMBER.fullmatch(name) is not None or (bool(word) and numbers[0] % 1 != 0)
     return suspect and any(numbers)

@@ -190,6 +190,7 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
 _DEEPEST = 4  # mappings within each other
 # Shares of the image's side by which the principal point is far from the middle, far outside, or in a corner.
 _OFF, _OUTSIDE, _CORNER = 0.2, 1.0, 0.1
+_SENSOR = 10.0  # px; a principal point nearer to the edge is in mm of a sensor
 _SHORTEST, _SHORT = 3.0, 0.02  # focal lengths that no camera has, in px and as a share of the image's width
 _SIDES = (
     ("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"), ("cam0", "cam1"), ("cam1", "cam2"),
@@ -260,7 +261,8 @@ def note_size(camera: Camera, document: Document) -> None:
     Raises InputError for a focal length that is not in pixels.
     """
     f, (u0, v0) = camera.intrinsics.alpha_u, camera.A[:2, 2]
-    if f < (_SHORTEST if camera.image_size is None else _SHORT * camera.image_size[0]):
+    tiny = camera.image_size is None and 0 < max(u0, v0) < _SENSOR and f < 10 * _SENSOR
+    if tiny or f < (_SHORTEST if camera.image_size is None else _SHORT * camera.image_size[0]):
         raise InputError(
             f"the focal length {f:.6g} is not in pixels, but in mm or relative to the image; convert the "
             "camera matrix to pixels"

@@ -318,6 +318,7 @@ class LooseKeys:
             if all(found):
                 return Distortion(model, np.array([entry.number() for entry in found if entry]))
         if coefficients is None:
+            self.lacks = model == UNKNOWN
             if xi is not None:
                 raise InputError(
                     "has xi of an omnidirectional camera without its distortion; add D, or zeros"
