@@ -144,6 +144,25 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         S,
     ),
     "Pix4D": (PIX4D, E, D5, S),
+    "OpenICC": (
+        {
+            "intrinsic_type": "FISHEYE",
+            "image_width": 640,
+            "image_height": 480,
+            "final_reproj_error": 0.21,
+            "intrinsics": {
+                "focal_length": 800.5,
+                "aspect_ratio": 801.25 / 800.5,
+                "skew": 0.0,
+                "principal_pt_x": 321.3,
+                "principal_pt_y": 238.7,
+                **{f"radial_distortion_{n}": one for n, one in enumerate(FOUR, 1)},
+            },
+        },
+        E,
+        FISH,
+        S,
+    ),
     "Blender's NeRF": (
         {
             "camera_angle_x": 2 * float(np.arctan(320 / 800.5)),

@@ -1,4 +1,4 @@
-"""Formats of calibration programs: Kalibr, mrcal, BoofCV, multical and calib.io.
+"""Formats of calibration programs: Kalibr, mrcal, BoofCV, multical, calib.io and OpenICC.
 
 Kalibr's camchains have lengths in metres, and ``T_cn_cnm1`` maps points from the previous camera to this one.
 The centre of the top-left pixel is (0, 0), because Kalibr uses OpenCV's corners. radtan is k1, k2, p1, p2;
@@ -380,4 +380,36 @@ MRCAL = Format(
     most_cameras=99,
     needs_size=True,
     rig="a file for each camera, `extrinsics` from a common reference",
+)
+
+# OpenICC (OpenCameraCalibrator), with the lenses of Theia.
+_OPENICC = CameraKeys(
+    "OpenICC",
+    ("focal_length", "fy", "principal_pt_x", "principal_pt_y"),
+    (
+        Lens(("PINHOLE",), "k1k2", under("radial_distortion_", "1", "2")),
+        Lens(("FISHEYE",), "fisheye", under("radial_distortion_", "1", "2", "3", "4")),
+    ),
+    model="intrinsic_type",
+    size=("image_width", "image_height"),
+    skew="skew",
+)
+
+
+def _read_openicc(document: Document) -> CameraSet:
+    root = document.root
+    own = root["intrinsics"]
+    fy = own["focal_length"].number() * own["aspect_ratio"].number()
+    tree = {**own.value, "fy": fy}
+    tree |= {key: root[key].value for key in ("intrinsic_type", "image_width", "image_height")}
+    return CameraSet((_OPENICC.camera(Field(tree, root.source)),), program="OpenICC")
+
+
+OPENICC = Format(
+    "OpenICC",
+    _OPENICC.models,
+    matches=lambda document: {"intrinsic_type", "intrinsics"} <= set(document.tree),
+    read=_read_openicc,
+    files="camera calibration of OpenCameraCalibrator, JSON",
+    skew=True,
 )

@@ -69,6 +69,7 @@ READ: tuple[Format, ...] = (
     capture.ANIPOSE,
     calibrators.MULTICAL,
     calibrators.CALIB_IO,
+    calibrators.OPENICC,
     capture.EASYMOCAP,
     sensors.ZED,
     sensors.OAK,
