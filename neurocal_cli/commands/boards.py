@@ -32,6 +32,7 @@ _UNKNOWN = "the {} is not given, so it is the unit of all lengths; give it by --
 
 _SELDOM = 0.2  # ratio of images with the described size to those with another; boards are seen in mirrors
 _COMPARED = 3  # images, with a described board with markers
+_PICTURES = (".pdf", ".svg", ".png", ".jpg", ".jpeg")
 _USUAL_SIDES = 1.0, 2000.0  # mm, of squares
 _FEW = 3  # images; fewer may by chance show the same part of the board
 
@@ -62,6 +63,11 @@ class BoardOptions:
             if (cols, rows, square, unit) != (None,) * 4:
                 raise UsageError(
                     "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+                )
+            stem, ending = os.path.splitext(self.file)
+            if ending.lower() in _PICTURES:
+                raise UsageError(
+                    f"--board {self.file} is a picture; give the board file, such as {stem}.yaml"
                 )
             if re.fullmatch(r"\d+x\d+(:[\d.]+)?", self.file) and not os.path.exists(self.file):
                 size, _, side = self.file.partition(":")

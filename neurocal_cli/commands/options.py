@@ -135,6 +135,16 @@ class Command(click.Command):
         given = [ctx.params.get(str(one.name)) for one in self.params if isinstance(one, Argument)]
         files = [file for one in given for file in (one if isinstance(one, tuple) else (one,)) if file]
         if ("POINTS" in usage[0] or ".csv" in usage[0]) and "FOLDER" not in usage[0]:
+            for file in files:
+                if set(file) & set("*?[") and not os.path.exists(file):
+                    from glob import glob
+
+                    advice = (
+                        "leave out the quotes, so that the shell names the files"
+                        if glob(file)
+                        else "check the path"
+                    )
+                    raise FormatError(f"is a pattern, not a file; {advice}", file)
             for folder in filter(os.path.isdir, files):
                 if images := _images(sorted(os.listdir(folder))):
                     advice = f"find its points first: {detect_line(os.path.join(folder, images[0]))}"

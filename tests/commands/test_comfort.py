@@ -136,6 +136,7 @@ def test_images_instead_of_points_are_recognised(command: str) -> None:
             "without a unit, or with --unit mm",
         ),
         (("detect", SAMPLES / "board01.png", "--board", "9x6"), 2, "give --board chessboard:9x6:SQUARE"),
+        (("detect", SAMPLES / "board01.png", "--board", "b.pdf"), 2, "give the board file, such as b.yaml"),
         (("detect", SAMPLES / "board01.png", "--jobs", "0"), 2, "0 is not possible; give 1 or more"),
         (("detect", SAMPLES / "board01.png", "--watch", "-o"), 2, "'-o' is not a number; give a number"),
         (("rectify", "rig.yaml", "left", "right"), 2, "-o is missing; give -o DIR"),
@@ -155,6 +156,8 @@ def test_a_name_that_the_shell_took_apart_is_put_together(
     result = run("calibrate", "my", "good", "points.csv")
     assert result.exit_code == 2
     assert "put it in quotes: 'my good points.csv'" in result.stderr
+    assert "leave out the quotes" in run("calibrate", "my*.csv").stderr
+    assert "is a pattern, not a file; check the path" in run("calibrate", "your*.csv").stderr
 
 
 @pytest.mark.parametrize(("side", "told"), [("0.025", True), ("25", False)])

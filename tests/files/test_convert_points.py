@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -444,3 +445,11 @@ def test_a_grid_with_other_ids_is_a_board_of_mrcal() -> None:
     lines = str(corner_text(given, "mrcal", "")).splitlines()
     assert len(lines) == 61
     assert lines == str(corner_text(points(pixels()), "mrcal", "")).splitlines()
+
+
+def test_an_archive_without_arrays_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "points.zip", "w") as archive:
+        archive.writestr("points.csv", "X,Y,Z,u,v\n")
+    result = run("calibrate", tmp_path / "points.zip")
+    assert result.exit_code == 1
+    assert "is a ZIP archive without arrays of NumPy; unpack it first" in result.stderr

@@ -220,12 +220,14 @@ def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if not any(name.endswith(".npy") for name in archive.namelist()):
+                raise FormatError("is a ZIP archive without arrays of NumPy; unpack it first", source)
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
                 raise FormatError("unpacks to more than 500 MB; give a file of cameras or points", source)
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             for name in arrays.files:
                 try:
-                    tree[name] = arrays[name].tolist()
+                    tree[name] = np.asarray(arrays[name]).tolist()
                 except ValueError as error:
                     if "Object arrays" not in str(error):
                         raise
