@@ -91,7 +91,8 @@ class Command(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse, and explain what new users mistake."""
         words = list(args)  # parsing empties args
-        _check_blanks(words)
+        if not ctx.resilient_parsing:  # as a shell parses, to complete what is not yet right
+            _check_blanks(words)
         try:
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
@@ -99,7 +100,8 @@ class Command(click.Command):
             if told is None:
                 raise
             raise click.UsageError(told, ctx) from None
-        self._check_files(ctx)
+        if not ctx.resilient_parsing:
+            self._check_files(ctx)
         return rest
 
     def _explained(self, error: click.UsageError, words: Sequence[str], ctx: click.Context) -> str | None:
