@@ -127,6 +127,18 @@ def test_windows_are_no_circles(width: int, height: int, gap: int) -> None:
         detect_points(cv2.GaussianBlur(image, (0, 0), 1.3), Board((plane_of("circles:7x6:20:12"),)))
 
 
+@pytest.mark.parametrize(("radius", "width"), [(14, 4), (18, 4), (12, 5)])
+def test_rings_are_round(radius: int, width: int) -> None:
+    image = np.full((320, 420), 226, np.uint8)
+    for row in range(6):
+        for column in range(7):
+            cv2.circle(image, (45 + 52 * column, 35 + 50 * row), radius, (30,), width, cv2.LINE_AA)
+    found = detect_points(cv2.GaussianBlur(image, (0, 0), 0.8), Board((plane_of("circles:7x6:20:12"),)))
+    assert len(found.ids) == 42
+    at = np.array([[int(part) for part in name.split(":")] for name in found.ids])
+    np.testing.assert_allclose(found.pixels, [45, 35] + at * [52, 50], atol=0.05)
+
+
 def test_another_number_of_circles_is_no_board() -> None:
     scene = marked_scene(plane_of(ASYMMETRIC), 2, square=22.0)
     image = taken(scene, 2).image

@@ -156,7 +156,7 @@ _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
 # Amplitudes of two and of four periods: at most 0.15 and 0.02 of circles of 6 px and more, blurred by up to
 # 3 px and tilted by up to 65 degrees, and of those moved by half of their radius.
-_LOPSIDED = 0.16, 0.03
+_LOPSIDED = 0.16, 0.055
 _SYMMETRIC = (
     "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
@@ -407,8 +407,9 @@ def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tupl
     radius = np.sqrt(area / (np.pi * np.maximum(np.abs(np.linalg.det(steps)), 1e-9)))
     angle = 2 * np.pi * np.arange(16) / 16
     ring = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    levels, inner, outer = (interpolate(light, centre[:, None] + s * ring @ steps) for s in (1.0, 0.3, 1.5))
-    contrast = np.abs(np.median(outer, axis=1) - np.median(inner, axis=1))
+    shares = (1.0, 0.3, 0.85, 1.15, 1.5)  # a ring may be light in its middle, and end near its hole
+    levels, *others = (interpolate(light, centre[:, None] + share * ring @ steps) for share in shares)
+    contrast = np.ptp(np.median(others, axis=2), axis=0)
     relative = (levels / np.maximum(contrast, 1.0)[:, None]).mean(axis=0)
     amplitudes = (np.abs((relative * np.exp(1j * n * angle)).mean()) for n in (2, 4))
     return any(one > limit for one, limit in zip(amplitudes, most, strict=True))
