@@ -22,9 +22,9 @@ by one step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
 
 With few views it is imprecise: used always, it would make the std of clean data a third too large with five
 views, and a quarter with ten. So it is used only if the views contradict each other more than chance allows,
-and it never goes below the covariance of the normal matrix. If each view has bends of its own, they hide such
-contradictions; then it is used if it is far larger than noise lets one expect. Views that repeat a pose
-(`repeated_poses`) count as one.
+and it never goes below the covariance of the normal matrix. A target that was estimated with bends of each
+view, or from few views, hides such contradictions; then it is used if it is far larger than noise lets one
+expect. Views that repeat a pose (`repeated_poses`) count as one.
 """
 
 from __future__ import annotations
@@ -232,10 +232,6 @@ def parameter_warnings(
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
-# Ratio of the jackknife's variance to the expected one from which on it is used for boards with a bend in
-# each view: above it in one (4.4) of the 143 such sets of test_simulated_targets.py, and 4.7 to 32 in
-# photographs (figures, "The board estimated with the camera").
-_GROWN = 3.0
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
 
 
@@ -248,7 +244,7 @@ def counting_views(
     n_residuals: float,
     repeated: RepeatedPoses,
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None,
-    bends: bool = False,
+    grown: float = np.inf,
 ) -> Covariance:
     """Covariances for residuals that are independent between views only.
 
@@ -256,8 +252,8 @@ def counting_views(
     than the residuals explain. `normal`, `free`, `free_poses` and `n_residuals` are as for
     `covariance.covariance`. `moves_without` takes the pose number of each view and returns the moves of the
     free parameters when the views of each pose are left out; it is needed if they do not follow from the
-    normal matrices. `bends` tells whether each view has bends of its own: they absorb contradictions between
-    views that have other causes, and only the jackknife reveals those.
+    normal matrices. An estimated target may absorb contradictions between views that have other causes; only
+    the jackknife reveals those, and is used as well from `grown` times the variance that noise explains on.
     """
     if not free.any() or not np.isfinite(found.entries).all():
         return found
@@ -275,13 +271,13 @@ def counting_views(
         entries = variance * S_inverse @ np.tensordot(repeated.variance, q.S, 1) @ S_inverse
     enough = len(q.cost) >= _FEWEST
     contradict = enough and _contradict(q if repeated.none else _weighed(q, repeated.variance), variance)
-    if contradict or (bends and enough):
+    if contradict or (enough and np.isfinite(grown)):
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
             moves = moves @ back.T
         jackknife = _jackknife(q.moves_without_each() if moves is None else moves)
         noise = _expected(q, repeated.variance, variance)
-        if contradict or _size(jackknife, entries) > _GROWN * _size(noise, entries):
+        if contradict or _size(jackknife, entries) > grown * _size(noise, entries):
             entries = _at_least(jackknife, entries)
     if entries is before or not np.isfinite(entries).all():
         return found

@@ -1,0 +1,66 @@
+"""A board that is estimated from few views takes in their contradictions, and the std say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.targets import SIZE, offsets, views_of
+
+from neurocal_cli import Correspondences, calibrate
+from neurocal_cli.camera.geometry import Array
+
+CENTRE = (np.array(SIZE) - 1) / 2
+TRUE = np.array([1000.0, 1000.0, *CENTRE])
+Change = Callable[[Correspondences, int], Correspondences]
+
+
+def views(n: int, seed: int) -> Correspondences:
+    """Views of a board whose points are off by 0.15 mm rms."""
+    rng = np.random.default_rng([seed, n, 41])
+    K = np.array([[1000.0, 0.0, CENTRE[0]], [0.0, 1000.0, CENTRE[1]], [0.0, 0.0, 1.0]])
+    off = offsets("both", 0.15, rng)
+    points, *_ = views_of(K, np.array([-0.2, 0.08]), "k1k2", lambda: off, n, 0.1, rng)
+    return points
+
+
+def moving(points: Correspondences, seed: int) -> Correspondences:
+    """The camera moves by about a pixel while the rows of each half image are read."""
+    by = np.random.default_rng([seed, 7]).standard_normal((points.n_views, 2))
+    rows = points.pixels[:, 1:] / CENTRE[1] - 1
+    return replace(points, pixels=points.pixels + by[points.view_index] * rows)
+
+
+def stabilised(points: Correspondences, seed: int) -> Correspondences:
+    """The centre of each view's own is off by about three pixels."""
+    by = 3.0 * np.random.default_rng([seed, 6]).standard_normal((points.n_views, 2))
+    return replace(points, pixels=points.pixels + by[points.view_index])
+
+
+def over_std(points: Correspondences) -> Array:
+    """Errors of alpha_u, alpha_v, u0 and v0 over their std, where the verdict is better than poor."""
+    found = calibrate(points)
+    assert found.target is not None
+    A, std = found.intrinsics, found.std
+    known = np.array([std["alpha_u"], std["alpha_v"], std["u0"], std["v0"]])
+    good = found.verdict is not None and found.verdict.word != "poor"
+    return np.array(good * (np.array([A.alpha_u, A.alpha_v, A.u0, A.v0]) - TRUE) / known)
+
+
+def test_a_board_from_five_views_hides_no_motion_of_the_camera() -> None:
+    """Without the jackknife over views, these errors are up to 15 standard deviations."""
+    errors = [over_std(moving(views(5, seed), seed)) for seed in range(4)]
+    assert np.abs(errors).max() < 4
+    assert np.sqrt(np.mean(np.square(errors))) < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [3, 4, 5])
+@pytest.mark.parametrize("change", [moving, stabilised])
+def test_hardly_a_result_of_few_views_is_far_beyond_its_std(n: int, change: Change) -> None:
+    """Without the jackknife over views, 9 of these 120 are beyond 5 std and the largest by 15."""
+    errors = np.array([over_std(change(views(n, seed), seed)) for seed in range(20)])
+    assert np.count_nonzero(np.abs(errors).max(axis=1) > 5) <= 1
+    assert np.sqrt(np.mean(errors**2)) < 2
