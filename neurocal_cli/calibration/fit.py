@@ -23,6 +23,7 @@ from neurocal_cli.calibration.lens_choice.given_model import (
     with_denominator_if_supported,
     with_more_starts,
 )
+from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.camera.state import CameraState
@@ -38,7 +39,6 @@ from neurocal_cli.observations.points import Correspondences
 _FIRST_MODEL = "k1k2"
 _TILT_ROUNDS, _TILT_STEPS = 2, 60
 _SKEW = 1  # place of A12 among A's entries
-_LEVEL = 6.0  # log odds, as of any cause of errors
 
 
 @quietly  # starts that run into a pole of the distortion or into the camera's plane lose
@@ -210,7 +210,7 @@ def _turned(solution: Solution) -> Solution:
 
 
 def shows_skew(solution: Solution) -> bool:
-    """Whether theta, which the solution holds at 90 degrees, has evidence: log odds above six.
+    """Whether theta, held at 90 degrees by the solution, has the evidence that causes of errors need.
 
     The log odds of one more unknown are n/2 log(c / c') - log(n)/2, for squared errors c and c' without and
     with it, and n independent equations, fewer where neighbouring residuals are alike.
@@ -224,4 +224,4 @@ def shows_skew(solution: Solution) -> bool:
         return False
     alike = correlation(problem.views, point_residuals(problem.views, solution.state))
     n = effective_number(max(problem.views.n_equations - skewed.n_parameters, 1.0), alike)
-    return bool(0.5 * n * np.log(cost / with_it) - 0.5 * np.log(n) > _LEVEL)
+    return bool(0.5 * n * np.log(cost / with_it) - 0.5 * np.log(n) > LEVEL)
