@@ -453,3 +453,12 @@ def test_an_archive_without_arrays_is_refused(tmp_path: Path) -> None:
     result = run("calibrate", tmp_path / "points.zip")
     assert result.exit_code == 1
     assert "is a ZIP archive without arrays of NumPy; unpack it first" in result.stderr
+
+
+def test_a_table_is_one_of_points_whatever_the_order_of_its_columns(tmp_path: Path) -> None:
+    rows = "".join(f"{8 * k + 1},{9 * k},0,{k},{2 * k % 7}\n" for k in range(12))
+    (tmp_path / "a.csv").write_text(f"v,u,Z,Y,X\n{rows}")
+    assert "12 points of 1 view" in run("convert", tmp_path / "a.csv", "--to", "neurocal").stderr
+    (tmp_path / "b.csv").write_text("view,row,col,u,v\na,0,0,1,2\na,0,1,3,4\n")
+    result = run("convert", tmp_path / "b.csv", "--to", "neurocal")
+    assert "columns X, Y, Z missing from the header" in result.stderr

@@ -47,9 +47,11 @@ TABLES = (".csv", ".txt", ".tsv")  # endings of tables of points
 BOARD_ADVICE = "give --board chessboard:COLSxROWS:SQUARE"
 _HEAD = 1_000_000  # characters that show of what kind a file is
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
-# A header with names of X and v, or a first row of five numbers.
+# A header with names of X and v, or of u and v, in any order; or a first row of five numbers.
 _TABLE = re.compile(
-    r"\A\ufeff?(?:#[^\n]*\n|\s*\n)*(?:[^\n#:{<]*(?:\bX\b|x_?world|world_?x|obj)[^\n:]*(?:\bv\b|img|pix|v_?px|image)"
+    r"\A\ufeff?(?:#[^\n]*\n|\s*\n)*(?:"
+    r"(?:(?=[^\n]*(?:\bX\b|x_?world|world_?x|obj))(?=[^\n]*(?:\bv\b|img|pix|v_?px|image))"
+    r"|(?=[^\n]*\bu\b)(?=[^\n]*\bv\b))[^\n:#{<=]*\r?\n"
     r"|(?:[-+0-9.eE]+[ \t]*[,;\t ][ \t]*){4}[-+0-9.eE]+[ \t]*\r?(?:\n|\Z))",
     re.IGNORECASE,
 )
