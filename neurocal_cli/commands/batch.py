@@ -120,11 +120,8 @@ def batch(
       #     --ship -o third
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
-    chosen = [
-        name
-        for name, value in (("--workers", workers), ("--jobs", jobs), ("--scheduler", scheduler))
-        if value
-    ]
+    ways = {"--workers": workers, "--jobs": jobs, "--scheduler": scheduler}
+    chosen = [name for name, value in ways.items() if value]
     if len(chosen) > 1:
         raise UsageError(f"{chosen[0]} and {chosen[1]} contradict each other; give one of them")
     if ship and scheduler is None:

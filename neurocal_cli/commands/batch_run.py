@@ -193,11 +193,8 @@ def _run(words: Words, lines: list[str], summaries: list[dict[str, Any]]) -> tup
         except NeurocalError as error:
             code, problem, machine = error.exit_code, str(error), is_of_machine(error)
         except Exception as error:
-            code, problem, machine = (
-                1,
-                f"internal error: {type(error).__name__}: {error}",
-                is_of_machine(error),
-            )
+            problem = f"internal error: {type(error).__name__}: {error}"
+            code, machine = 1, is_of_machine(error)
         if problem:
             problem = one_line(problem)
             tell(f"Error: {problem}")

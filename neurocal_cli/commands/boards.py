@@ -224,13 +224,7 @@ def board_in_images(paths: Sequence[str], given: BoardOptions, enough: int) -> B
         warn(f"no image shows that the board ends {sides}; if it has more {more}")
     if given.square is None:
         note(_UNKNOWN.format(length))
-        unit = (
-            "squares"
-            if length == "side of a square"
-            else "tags"
-            if length == "side of a tag"
-            else "distances"
-        )
+        unit = {"side of a square": "squares", "side of a tag": "tags"}.get(length, "distances")
     return Board((plane.rescaled(side),), unit)
 
 

@@ -123,13 +123,7 @@ class Command(click.Command):
                 return f"{error.param.opts[0]} is missing; choose from {', '.join(map(str, kind.choices))}."
             return f"{error.param.opts[0]} is missing; give {error.param.opts[0]} {error.param.metavar}."
         images = _images(words) if type(error) is click.UsageError and self._reads_points() else []
-        if not images:
-            return None
-        some = f"{', '.join(images[:2])}{', ...' if len(images) > 2 else ''}"
-        return (
-            f"{some}: these are images; find the points in those of each camera first: "
-            f"{detect_line(images[0])}"
-        )
+        return _points_first(images) if images else None
 
     def _check_files(self, ctx: click.Context) -> None:
         """Refuse folders of images instead of points, and files in front of that of their camera."""
@@ -151,6 +145,8 @@ class Command(click.Command):
                 if images := _images(sorted(os.listdir(folder))):
                     advice = f"find its points first: {detect_line(os.path.join(folder, images[0]))}"
                     raise FormatError(f"is a folder of images; {advice}", folder)
+        if ("LEFT.csv" in usage[0] or "NAME=" in usage[0]) and (images := _images(files)):
+            raise click.UsageError(_points_first(images), ctx)
         if ".yaml" in usage[0] and not any(".yaml" in word for word in usage[1:]):
             mistaken = _images(files[:1]) or [file for file in files[:1] if file.lower().endswith(".csv")]
             if mistaken and any(file.lower().endswith((".yaml", ".yml")) for file in files[1:]):
@@ -189,6 +185,14 @@ def _check_blanks(words: Sequence[str]) -> None:
             name = " ".join(words[k:end])
             if not os.path.exists(word) and os.path.exists(name):
                 raise UsageError(f"{name} has blanks in its name; put it in quotes: {shlex.quote(name)}")
+
+
+def _points_first(images: Sequence[str]) -> str:
+    """What to do with images of several cameras."""
+    some = f"{', '.join(images[:2])}{', ...' if len(images) > 2 else ''}"
+    return (
+        f"{some}: these are images; find the points in those of each camera first: {detect_line(images[0])}"
+    )
 
 
 def _images(words: Iterable[str]) -> list[str]:

@@ -132,14 +132,9 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
         raise UsageError("the file is of one camera; give --images once")
     words = images * (len(cameras) if len(images) == 1 else 1)
     shown = [_photographs(*one, len(cameras)) for one in zip(cameras, words, strict=False)]
-    versions = {} if block is None else _versions(block)
+    known = block is not None and "version" in block["neurocal"]
+    versions = {"neurocal": block["neurocal"]["version"].text()} if block is not None and known else {}
     return page_of(result, Origin(files, versions=versions), shown)
-
-
-def _versions(root: Field) -> dict[str, str]:
-    """The version with which the file was written, according to the file."""
-    block = root["neurocal"]
-    return {"neurocal": block["version"].text()} if "version" in block else {}
 
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:

@@ -269,15 +269,8 @@ def stereo(
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     if left_intrinsics is not None and right_intrinsics is not None:
-        known = (
-            "no_skew",
-            "skew",
-            "fix",
-            "square_pixels",
-            "distortion",
-            "image_center",
-            *(["type"] if estimation.type == "2" else []),
-        )
+        known = ["no_skew", "skew", "fix", "square_pixels", "distortion", "image_center"]
+        known += ["type"] if estimation.type == "2" else []
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
     preparation.check((*inputs, board), (output, html, *ros_files), plots=files_of(plots), as_json=as_json)

@@ -120,6 +120,7 @@ def test_images_instead_of_points_are_recognised(command: str) -> None:
         (("detect", SAMPLES / "board01.png", "--cols", "nine"), 2, "is not a valid whole number"),
         (("convert", SAMPLES / "flat.csv"), 2, "--to is missing; choose from neurocal, opencv, ros,"),
         (("evaluate", SAMPLES / "flat.csv"), 1, "flat.csv -o camera.yaml"),
+        (("stereo", SAMPLES / "board01.png", SAMPLES / "board02.png"), 2, "in those of each camera first"),
         (("undistort", SAMPLES / "flat.csv", "a.png", "-o", "d"), 1, "give a camera file here"),
         (
             ("undistort", "a.png", "camera.yaml", "-o", "d"),

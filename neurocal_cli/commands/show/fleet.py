@@ -21,13 +21,8 @@ from neurocal_cli.commands.show.text import printable
 Row = dict[str, Any]
 # Parameters that have a column; a rich lens has dozens more.
 _NAMED = re.compile(r"alpha_[uv]|[uv]0|theta|[kps]\d|tau_[xy]|xi|alpha|beta")
-_OF_FLEET = (
-    "alpha_u",
-    "alpha_v",
-    "u0",
-    "v0",
-    "baseline",
-)  # parameters that are compared with those of the fleet
+# Parameters that are compared with those of the fleet.
+_OF_FLEET = ("alpha_u", "alpha_v", "u0", "v0", "baseline")
 _FALSE = 0.1  # share of batches with any unchanged camera that is said to have changed
 # What has happened if the chance of an unchanged camera, and of an unchanged pose, is too small.
 _SHARES = {"drift_share": "changed", "pose_share": "moved"}
@@ -168,7 +163,7 @@ def fleet_page(rows: Sequence[Row], name: str) -> str:
     """Make the page of the rows of a summary; it stands beside the folders of the jobs, to which it links."""
     status = Counter(row["status"] for row in {row["name"]: row for row in rows}.values())
     verdicts = Counter(row["verdict"] for row in rows if row.get("verdict"))
-    head = f"{sum(status.values())} jobs: {_counted(status)}"
+    head = f"{sum(status.values())} jobs: {', '.join(f'{count} {word}' for word, count in status.items())}"
     judged = ", ".join(f"{verdicts[word]} {word}" for word in _WORDS if verdicts[word])
     parts = [f'<p class="soft">{escape(head)}{f"; cameras: {judged}" if judged else ""}</p>']
     parts += [
@@ -179,10 +174,6 @@ def fleet_page(rows: Sequence[Row], name: str) -> str:
         section("Cameras", _table(rows)),
     ]
     return page(f"Fleet {printable(name)}", [part for part in parts if part])
-
-
-def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {word}" for word, count in counts.items())
 
 
 def _list(rows: Iterable[Row], text: Callable[[Row], str]) -> str:

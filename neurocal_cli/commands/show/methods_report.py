@@ -87,14 +87,8 @@ def comparison_report(comparison: Comparison) -> str:
         below += [f"{line}{method}: {one.problem}" for method, one in camera.items() if one.problem]
     if comparison.stereo is not None:
         unit = comparison.unit
-        head = [
-            "method",
-            f"RMSE [{unit}]",
-            "NSCE",
-            f"baseline [{unit}]",
-            f"through one rig: RMSE [{unit}]",
-            "NSCE",
-        ]
+        head = ["method", f"RMSE [{unit}]", "NSCE", f"baseline [{unit}]"]
+        head += [f"through one rig: RMSE [{unit}]", "NSCE"]
         rows = [head]
         for method, pair in comparison.stereo.items():
             rig = ["-", "-"] if pair.rig is None else [_digits(pair.rig.rmse), _digits(pair.rig.nsce)]
