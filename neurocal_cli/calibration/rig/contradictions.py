@@ -44,7 +44,7 @@ def without_contradictions(
     problem: RigProblem, start: Sequence[Pose], left_out: LeftOut, refine_cameras: bool, names: list[str]
 ) -> tuple[RigFit, LeftOut, list[str]]:
     """The common fit, the views that it leaves out, and its warnings."""
-    times = _times(problem)
+    times = problem.times
     told = [f"{name} camera" if name in ("left", "right") else f"camera {name}" for name in names]
 
     def fitted() -> tuple[RigFit, list[str]]:
@@ -103,13 +103,6 @@ def with_delays(fit: RigFit, times: Sequence[Array] | None, names: Sequence[str]
             if evidence > most:
                 best, most = trial, evidence
     return best
-
-
-def _times(problem: RigProblem) -> list[Array] | None:
-    """Times of each camera's views, if all are known."""
-    times = [camera.points.view_times for camera in problem.calibrations]
-    known = [one for one in times if one is not None]
-    return known if len(known) == len(times) else None
 
 
 def _detached(problem: RigProblem, left_out: Mapping[tuple[int, str], str], names: list[str]) -> RigProblem:

@@ -190,6 +190,13 @@ class RigProblem:
         return tuple(estimated_parameters(calibration) for calibration in self.calibrations)
 
     @property
+    def times(self) -> list[Array] | None:
+        """Stated times of each camera's views, (V_c,); None if some are not known."""
+        times = [calibration.points.view_times for calibration in self.calibrations]
+        known = [one for one in times if one is not None]
+        return known if len(known) == len(times) else None
+
+    @property
     def n_rig(self) -> int:
         """Number of unknowns of the rig itself."""
         return (6 if self.motion is None else 7) * (len(self.cameras) - 1)

@@ -53,18 +53,14 @@ def fitted(rig: Rig) -> RigFit:
     problem = rig_problem(list(rig.cameras.values()), of_views)
     state = problem.start(list(rig.poses.values())[1:])
     if rig.delays:
-        motion = motion_of(problem, state, _times(rig)) or motion_of(problem, state, None)
+        motion = motion_of(problem, state, problem.times if rig.timed else None) or motion_of(
+            problem, state, None
+        )
         if motion is not None:
             delay = np.array([rig.delays.get(name, (0.0, 0.0))[0] for name in rig.cameras])
             problem = replace(problem, motion=motion)
             state = replace(state, delay=delay, timed=True)
     return adjust_rig(problem, state, problem.estimated_shared)
-
-
-def _times(rig: Rig) -> list[Array] | None:
-    times = [camera.points.view_times for camera in rig.cameras.values()] if rig.timed else []
-    known = [one for one in times if one is not None]
-    return known if times and len(known) == len(times) else None
 
 
 def camera_in_pixels(fit: RigFit, side: int) -> Camera:
