@@ -129,6 +129,9 @@ def _held_out(fit: RigFit) -> float:
     whole, _ = fit.normal.only(free).reduced()
     lost, cost = 0.0, 0.0
     for k in range(int(fold.max()) + 1):
+        left = several[fold[several] != k]
+        if not all(np.isin(left, observed.view).any() for observed in problem.observations):
+            continue  # a camera of which no frame is left has no place
         some = [
             ViewEquations(one.place, one.frame[inside], one.M[inside])
             for one in views
