@@ -52,6 +52,7 @@ _FAULTS = (
 AGREED, LEAST_AGREED = 0.8, 3
 """Share of the pairs, and fewest pairs, that must agree once a mistake is undone."""
 
+EXCHANGED = "the left and the right image are exchanged"
 UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
 PAIR_ANEW = (
     "one image of one camera is missing or was taken twice; name the views that were taken at the same "
@@ -227,7 +228,7 @@ def _reasons(
     flat = problem.is_flat[problem.paired]
     reasons = np.where(
         (distance < _EXCHANGED) & (distance < _NEARER * plain),
-        "the left and the right image are exchanged",
+        EXCHANGED,
         UNSYNCHRONISED,
     )
     for reason, of_target, of_image in _FAULTS:

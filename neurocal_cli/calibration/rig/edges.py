@@ -21,6 +21,7 @@ from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA, along, seen_by
 from neurocal_cli.calibration.rig.consensus import (
+    EXCHANGED,
     HYPOTHESES,
     LEAST_AGREED,
     OPPOSITE,
@@ -327,15 +328,17 @@ def pair_name(pair: tuple[str, str]) -> str:
     return pair[0] if pair[0] == pair[1] else f"{pair[0]}/{pair[1]}"
 
 
-def views_left_out(edges: Sequence[Edge], problem: RigProblem) -> dict[tuple[int, str], str]:
+def views_left_out(
+    edges: Sequence[Edge], problem: RigProblem, names: Sequence[str]
+) -> dict[tuple[int, str], str]:
     """Views with most of the faults of their frames, by the index of the camera, and why.
 
     As long as two views of a frame contradict each other, the one that contradicts most others is left out.
     """
     by_frame: dict[int, list[tuple[tuple[int, str], tuple[int, str], str]]] = {}
     agreed: dict[tuple[int, str], int] = {}
-    frame_of = [dict(zip(names, seen.view.tolist(), strict=True))
-                for names, seen in zip(problem.names, problem.observations, strict=True)]  # fmt: skip
+    frame_of = [dict(zip(own, seen.view.tolist(), strict=True))
+                for own, seen in zip(problem.names, problem.observations, strict=True)]  # fmt: skip
     for edge in edges:
         if not edge.is_sound:
             continue
@@ -353,10 +356,21 @@ def views_left_out(edges: Sequence[Edge], problem: RigProblem) -> dict[tuple[int
         if len(problem.calibrations) == 2:  # neither view can be told from the other
             found |= {view: why for one, other, why in bad for view in (one, other)}
             continue
+        # Such images fit no other camera either, which must not outvote what is known.
+        exchanged = {
+            view: f"exchanged with the image of camera {names[partner[0]]}"
+            for one, other, why in bad
+            if why == EXCHANGED
+            for view, partner in ((one, other), (other, one))
+        }
         while bad:
             views = [view for one, other, _ in bad for view in (one, other)]
             worst = max(views, key=lambda view: (views.count(view), -agreed.get(view, 0)))
-            reasons = [_as_told(why, worst == one) for one, other, why in bad if worst in (one, other)]
+            reasons = [
+                exchanged.get(worst) or _as_told(why, worst == one)
+                for one, other, why in bad
+                if worst in (one, other)
+            ]
             found[worst] = max(reasons, key=reasons.count)
             bad = [entry for entry in bad if worst not in entry[:2]]
     return found

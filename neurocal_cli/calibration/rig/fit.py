@@ -89,7 +89,7 @@ def fit_rig(
         raise DegenerateGeometryError(told)
     start = connected(edges, names)
     _refuse_poor_camera(edges, names)
-    left_out = views_left_out(edges, problem)
+    left_out = views_left_out(edges, problem, names)
     fit, left_out, warnings = without_contradictions(problem, start, left_out, refine_cameras, names)
     _refuse_if_most_contradict(left_out, problem, names)
     if outliers == "keep" and left_out:

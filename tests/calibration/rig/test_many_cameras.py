@@ -278,6 +278,18 @@ def test_cameras_that_have_each_others_images_from_some_frame_on_are_named(
         calibrate_rig(points, skew=False, distortion="k1k2", target="given")
 
 
+def test_the_exchanged_images_of_one_frame_are_named() -> None:
+    _, points = scene("line", 4, 20)
+    one, other = points["cam1"], points["cam2"]
+    for name, own, strange in (("cam1", one, other), ("cam2", other, one)):
+        points[name] = joined(of_frames(own, lambda k: k != 4), of_frames(strange, lambda k: k == 4))
+    rig = calibrate_rig(points, skew=False, distortion="k1k2", target="given")
+    assert rig.left_out == {
+        ("cam1", "004"): "exchanged with the image of camera cam2",
+        ("cam2", "004"): "exchanged with the image of camera cam1",
+    }
+
+
 def test_a_wrong_view_is_left_out_and_the_others_of_its_frame_are_kept() -> None:
     _, points = scene("line", 4, 20)
     wrong = points["cam2"]
