@@ -230,6 +230,8 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: exchanged(seen(scene()), [3]), "left04/right04: the left and the right image are exchanged"),
     "images of every other pair exchanged": (
         lambda: exchanged(seen(scene()), [1, 3, 5, 7, 9, 11]), "exchanged"),
+    "images exchanged from the seventh pair on": (
+        lambda: exchanged(seen(scene()), list(range(6, 12))), "exchanged between left06 and left07"),
     "board turned round in one right image": (
         lambda: half_turned(seen(scene()), [5]), "left06/right06: the target is turned by 180"),
     "board turned round in every right image": (

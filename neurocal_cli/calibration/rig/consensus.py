@@ -38,6 +38,7 @@ _SIGMAS = 30.0
 HYPOTHESES = 40
 """Most pairs of which each is tried as the one that is right."""
 _EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
+_LIMITS = np.array([0.5, 1.0]) * _EXCHANGED  # which are tried for pairs from some frame on
 _NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
 _TURNED = "the target is turned by {} degrees in one of the images"
 _MIRRORED = "one of the two images is mirrored, or its u and v are exchanged"
@@ -123,7 +124,8 @@ def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> t
     """
     other = {a: b, b: a}
     edges = [(a, b), *((one, c) for c in range(len(problem.cameras)) if c not in other for one in (a, b))]
-    agreed, n_pairs = np.zeros(len(place) + 1), np.zeros(len(place), dtype=int)
+    n = len(place)
+    agreed, n_pairs = np.zeros((len(_LIMITS), n + 1)), np.zeros(n, dtype=int)
     for c, d in edges:
         as_named, after = problem.of_two(c, d), problem.of_two(other[c], other.get(d, d))
         sides = (as_named, c), (after, other[c])
@@ -131,20 +133,20 @@ def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> t
         if not offers:
             continue
         R, t = (np.concatenate(part) for part in zip(*offers, strict=True))
-        fits = np.zeros((2, len(R), len(place) + 1))
+        fits = np.zeros((2, len(_LIMITS), len(R), n + 1))
         for own, (two, first) in zip(fits, sides, strict=True):
             frames = place[problem.observations[first].view[two.paired_left]]
-            own[:, 1 + frames] = _distance(two, _poses(two), R, t) < _EXCHANGED
+            own[..., 1 + frames] = _distance(two, _poses(two), R, t) < _LIMITS[:, None, None]
             n_pairs[frames] += two is as_named
         # As named before each place, and exchanged from there on.
-        before, exchanged = fits.cumsum(axis=2)
-        agreed += (before + exchanged[:, -1:] - exchanged).max(axis=0)
-    at = int(np.argmax(agreed))
-    gain, odd = agreed[at] - agreed[-1], n_pairs.sum() - agreed[-1]
-    if gain < max(2 * LEAST_AGREED, AGREED * odd):
-        return None
+        before, exchanged = fits.cumsum(axis=3)
+        agreed += (before + exchanged[..., -1:] - exchanged).max(axis=1)
     seen = np.flatnonzero(n_pairs)
-    return int(seen[seen < at].max(initial=0)), int(seen[seen >= at].min(initial=len(place) - 1))
+    for some in agreed:
+        at = int(np.argmax(some))
+        if some[at] - some[-1] >= max(2 * LEAST_AGREED, AGREED * (n_pairs.sum() - some[-1])):
+            return int(seen[seen < at].max(initial=0)), int(seen[seen >= at].min(initial=n - 1))
+    return None
 
 
 def neighbours(pairs: Sequence[Pair], word: str) -> list[Pair]:

@@ -17,6 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA, along, seen_by
@@ -85,6 +86,7 @@ class RelativePoses:
         return M[:-1, :-1], M[:-1, -1]
 
 
+@quietly  # a pair behind its cameras tells nothing
 def relative_poses(problem: RigProblem, rig: Pose) -> RelativePoses | None:
     """Relative poses of all pairs of two cameras, by a rig near most; None if they are not determined.
 
@@ -266,7 +268,7 @@ def exchanged_cameras(edges: Sequence[Edge], problem: RigProblem, names: Sequenc
         odd[list(edge.cameras)] += len(edge.consensus.reasons) - edge.n_agreed
     most = np.argsort(-odd, kind="stable")[:_PARTNERS]
     suspects = sorted(most[odd[most] >= LEAST_AGREED].tolist())
-    if len(names) < 3 or len(suspects) < 2:
+    if len(suspects) < 2:
         return ""
     word: dict[int, str] = {}
     for own, seen in zip(problem.names, problem.observations, strict=True):
