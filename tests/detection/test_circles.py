@@ -7,9 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from support.marked import errors_of, marked_scene, plane_of, taken
+from support.marked import errors_of, marked_scene, plane_of, ringed, taken
 from support.occluders import Disc
 from support.picture_bound import edge_bound
+from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.lattice import Blobs, place_circles
@@ -125,6 +126,16 @@ def test_windows_are_no_circles(width: int, height: int, gap: int) -> None:
             image[top : top + height + 1, left + width // 2 : left + width // 2 + gap] = 190
     with pytest.raises(NoBoardError):
         detect_points(cv2.GaussianBlur(image, (0, 0), 1.3), Board((plane_of("circles:7x6:20:12"),)))
+
+
+@pytest.mark.parametrize("hole", slow_but((0.7,), (0.3, 0.5, 0.7, 0.8)))
+def test_rings_are_measured_at_the_outline_that_is_found(hole: float) -> None:
+    scene = marked_scene(plane_of(ASYMMETRIC), 1, square=22.0, tilt=10.0)
+    picture = ringed(scene, hole, 1)
+    error, squared = errors_of(detect_points(picture.image, scene.board), picture)
+    assert len(error) == 28
+    assert np.sqrt((error**2).mean()) < 0.008
+    assert 0.6 < squared.mean() < 1.6
 
 
 @pytest.mark.parametrize(("radius", "width"), [(14, 4), (18, 4), (12, 5)])

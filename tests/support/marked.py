@@ -14,7 +14,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection.detect import Detection
 from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.observations.board_kinds import TagPlane
+from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 from neurocal_cli.simulation.rendering import Illumination, Rendered, Scene, Sensor, Target, ground_truth
 from neurocal_cli.simulation.rendering.render import digitised, image_light
 
@@ -80,6 +80,20 @@ def taken(scene: Scene, seed: int, parts: int = 5) -> Rendered:
     """A picture of a scene; fewer `parts` are faster and less exact."""
     rng = np.random.default_rng([seed, 45])
     return Rendered(digitised(scene.sensor, image_light(scene, parts), rng), ground_truth(scene))
+
+
+def ringed(scene: Scene, hole: float, seed: int) -> Rendered:
+    """A picture of a scene with a grid of circles, of which the middle is light up to a share of the radius."""
+    (target,) = scene.targets
+    plane = target.plane
+    assert isinstance(plane, CirclePlane)
+
+    def light(share: float) -> Array:
+        discs = replace(target, plane=replace(plane, diameter=share * plane.diameter))
+        return image_light(replace(scene, targets=(discs,)), 5)
+
+    rings = light(1.0) - light(hole) + light(1e-3)
+    return Rendered(digitised(scene.sensor, rings, np.random.default_rng([seed, 45])), ground_truth(scene))
 
 
 def truth_of(picture: Rendered) -> tuple[dict[str, Array], set[str]]:

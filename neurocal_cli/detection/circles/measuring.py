@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.lattice import PlacedCircles, find_blobs, place_circles
+from neurocal_cli.detection.finding.saddles import interpolate
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     BatchFit,
@@ -59,6 +60,9 @@ _REACH = 4.0  # sigma on both sides of the outline
 _ROUGHLY = 1.5  # of that, for a first selection
 _ROOM = 0.5  # of the distance to the next circle; farther pixels may show it
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_SHARES = np.arange(0.3, 2.6, 0.05)  # of the radius, where the light may turn back
+_BACK = 0.3  # least share of its change by which it does
 _RADII = (0.6, 0.8, 1.0, 1.2, 1.4)  # of samples of the map around a circle, over its radius
 
 
@@ -78,22 +82,22 @@ def outline_pixels(
     places: Array,
     radius: float,
     blur: float,
-    apart: float,
+    band: tuple[float, float],
     shading: Shading | None,
 ) -> CirclePixels:
     """Gather the pixels around the outlines of circles at places (N, 2), padded to the same number.
 
-    `radius` and the distance `apart` of two circles are in the unit of the places, `blur` in px.
+    `radius` and the least and greatest distance of pixels from the centres, the `band`, are in the unit of
+    the places, `blur` in px.
     """
-    ring = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-    samples = np.concatenate([[[0.0, 0.0]], *(share * radius * ring for share in _RADII)])
+    samples = np.concatenate([[[0.0, 0.0]], *(share * radius * _CIRCLE for share in _RADII)])
     seen, reach = at.at(places[:, None] + samples), _REACH * blur
     middle = seen[:, 0]
     outline = seen[:, 1 + 2 * len(_ANGLES) : 1 + 3 * len(_ANGLES)]
-    point, d, normal, bend, rho, band = _distances(seen, samples, radius, _around(outline, reach), reach)
-    band &= (np.abs(d) < reach) & (rho < _ROOM * apart)
-    framed = band & (point >= 0).all(axis=2) & (point < image.shape[::-1]).all(axis=2)
-    beyond = 1 - framed.sum(axis=1) / np.maximum(band.sum(axis=1), 1)
+    point, d, normal, bend, rho, near = _distances(seen, samples, radius, _around(outline, reach), reach)
+    near &= (np.abs(d) < reach) & (rho > band[0]) & (rho < band[1])
+    framed = near & (point >= 0).all(axis=2) & (point < image.shape[::-1]).all(axis=2)
+    beyond = 1 - framed.sum(axis=1) / np.maximum(near.sum(axis=1), 1)
     index, used = packed(framed, framed.sum(axis=1))
     u, v, d, n_u, n_v, bend = (
         x.reshape(-1)[index] for x in (*np.moveaxis(point, 2, 0), d, *np.moveaxis(normal, 2, 0), bend)
@@ -187,7 +191,8 @@ def measure_circles(
     apart = np.sqrt(2) if plane.asymmetric else 1.0
     blur, shading = _FIRST_BLUR, None
     for _ in range(_ROUNDS):
-        pixels = outline_pixels(light, found.map, places, radius, blur, apart, shading)
+        band = _band(light, found.map, places, radius, _ROOM * apart)
+        pixels = outline_pixels(light, found.map, places, radius, blur, band, shading)
         fit = _fitted(pixels, blur, floor)
         sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
         if sharpening is not None:
@@ -221,6 +226,24 @@ def measure_circles(
         rejected=0,
         polarity=0.0,
     ).only(good)
+
+
+def _band(
+    light: NDArray[np.float32], at: SmoothMap, places: Array, radius: float, room: float
+) -> tuple[float, float]:
+    """Least and greatest distance from the centres at which only the outline changes the light.
+
+    A ring has another outline: the light turns back in its middle.
+    """
+    rho = radius * _SHARES[_SHARES * radius < room]
+    seen = at.at(places[:, None] + (rho[:, None, None] * _CIRCLE).reshape(-1, 2))
+    levels = np.median(interpolate(light, seen).reshape(len(places), len(rho), -1), axis=2)
+    levels -= levels.min(axis=1, keepdims=True)
+    profile = np.median(levels / np.maximum(levels.max(axis=1, keepdims=True), 1e-9), axis=0)
+    within = int(np.count_nonzero(rho < radius))
+    darkest, lightest = int(profile[:within].argmin()), within + int(profile[within:].argmax())
+    back = profile[: darkest + 1].max() - profile[darkest], profile[lightest] - profile[lightest:].min()
+    return float(rho[darkest]) if back[0] > _BACK else 0.0, float(rho[lightest]) if back[1] > _BACK else room
 
 
 def _missed(plane: CirclePlane, found: NDArray[np.int64]) -> NDArray[np.int64]:
