@@ -83,7 +83,7 @@ def taken(scene: Scene, seed: int, parts: int = 5) -> Rendered:
 
 
 def ringed(scene: Scene, hole: float, seed: int) -> Rendered:
-    """A picture of a scene with a grid of circles, of which the middle is light up to a share of the radius."""
+    """A picture of a grid of circles whose middles are light up to a share of the radius, the `hole`."""
     (target,) = scene.targets
     plane = target.plane
     assert isinstance(plane, CirclePlane)
