@@ -200,7 +200,7 @@ def test_errors_over_the_bound(form: str, square: float, condition: dict[str, fl
     assert isinstance(plane, CirclePlane)
     every, normal, bounds = [], [], []
     for seed in range(4):
-        scene = marked_scene(plane, seed, square=square, size=np.zeros((480, 640), np.uint8), **condition)  # type: ignore[arg-type]
+        scene = marked_scene(plane, seed, square=square, size=(640, 480), **condition)  # type: ignore[arg-type]
         picture = taken(scene, seed, 8)
         error, squared = errors(detect_points(picture.image, scene.board), picture)
         assert len(error) == picture.truth.planes[0].vertices_visible.sum()
