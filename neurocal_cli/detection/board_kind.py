@@ -263,8 +263,9 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
             break
     if not seen.kind and seen.patterned:
         raise NoBoardError(
-            "the squares of the board have patterns in them, but no markers can be read; show them sharper, "
-            "or describe the board by --board, for example charuco:8x6:28:21"
+            "the squares of the board are blurred or have patterns in them, and no markers can be read; take "
+            "sharper images, or describe the board by --board, for example chessboard:9x6:25 or "
+            "charuco:8x6:28:21"
         )
     if not seen.kind:
         raise NoBoardError(

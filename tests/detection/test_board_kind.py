@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from support.marked import errors_of, marked_scene, plane_of, taken
+from support.places import SAMPLES
 from support.real_data import RealFiles
 
 from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
@@ -17,6 +18,7 @@ from neurocal_cli.detection.markers.numbering import joined, layouts, lie_of, nu
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.files.board_kinds import kind_of
+from neurocal_cli.files.images import read_image
 from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import TagPlane
 from neurocal_cli.observations.marked_cells import Print, marked_cells
@@ -190,3 +192,9 @@ def test_tags_without_squares_at_their_corners_are_named() -> None:
         image[top : top + 70, left : left + 70] = cv2.aruco.generateImageMarker(family, k, 70)
     with pytest.raises(NoBoardError, match="4x3 tags without dark squares at their corners"):
         found_board([cv2.GaussianBlur(image, (0, 0), 0.8)])
+
+
+def test_a_blurred_chessboard_is_not_told_to_have_markers() -> None:
+    image = np.array(read_image(SAMPLES / "board02.png").grey)
+    with pytest.raises(NoBoardError, match="are blurred or have patterns in them.*sharper images"):
+        found_board([cv2.GaussianBlur(image, (0, 0), 7.0)])
