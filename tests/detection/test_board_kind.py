@@ -196,5 +196,5 @@ def test_tags_without_squares_at_their_corners_are_named() -> None:
 
 def test_a_blurred_chessboard_is_not_told_to_have_markers() -> None:
     image = np.array(read_image(SAMPLES / "board02.png").grey)
-    with pytest.raises(NoBoardError, match="are blurred or have patterns in them.*sharper images"):
+    with pytest.raises(NoBoardError, match=r"are blurred or have patterns in them.*sharper images"):
         found_board([cv2.GaussianBlur(image, (0, 0), 7.0)])
