@@ -45,8 +45,8 @@ _PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400
 _LONGEST_STEP = 1.5  # px; insensitive, test_finding.py
 
 # Parts that may have small squares: side of the neighbourhood of a saddle point [px], least number of them in
-# it, and what is added around [px].
-_NEIGHBOURHOOD, _NEIGHBOURS, _ROOM = 19, 9, 49
+# it, itself included, side of the cells that make a part [px], and of what is around a cell [cells].
+_NEIGHBOURHOOD, _NEIGHBOURS, _CELL, _ROOM = 19, 9, 8, 7
 
 _ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -169,13 +169,15 @@ def dense_parts(coarse: Level) -> list[tuple[slice, slice]]:
     u, v = _steepest_pixels(coarse, None).astype(np.intp).T
     steep = np.zeros(coarse.image.shape, dtype=np.uint8)
     steep[v, u] = 1
-    near = cv2.boxFilter(steep, cv2.CV_16U, (_NEIGHBOURHOOD,) * 2, normalize=False)
-    dense = steep * (near >= _NEIGHBOURS)
+    near = cv2.boxFilter(steep, cv2.CV_16U, (_NEIGHBOURHOOD,) * 2, normalize=False)[v, u] >= _NEIGHBOURS
+    height, width = coarse.image.shape
+    dense = np.zeros((height // _CELL + 1, width // _CELL + 1), dtype=np.uint8)
+    dense[v[near] // _CELL, u[near] // _CELL] = 1
     wide = cv2.dilate(dense, np.ones((_ROOM,) * 2, dtype=np.uint8))
     _, _, boxes, _ = cv2.connectedComponentsWithStats(wide)
     return [
-        (slice(2 * top, 2 * (top + high)), slice(2 * left, 2 * (left + broad)))
-        for left, top, broad, high, _ in boxes[1:].tolist()
+        (slice(top, top + high), slice(left, left + broad))
+        for left, top, broad, high in (2 * _CELL * boxes[1:, :4]).tolist()
     ]
 
 
