@@ -411,3 +411,17 @@ def test_a_board_half_in_a_deep_shadow_is_found(light: float, seed: int) -> None
     hit, wrong = best_match(find_grids(image), truth)
     assert wrong == 0
     assert hit.mean() > 0.8
+
+
+@pytest.mark.parametrize(("side", "narrow"), [(5, 1.0), (8, 0.5)])
+def test_squares_too_small_for_the_searched_levels_are_found(side: int, narrow: float) -> None:
+    board = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((4 * side, 4 * side)))
+    smooth = cv2.GaussianBlur(np.pad(board, 4 * side, constant_values=1).astype(np.float32), (0, 0), 3.0)
+    c, s = 0.25 * np.cos(0.3), 0.25 * np.sin(0.3)
+    M = np.array([[c, -s * narrow, 1000.3], [s, c * narrow, 700.7]])
+    light = cv2.warpAffine(smooth, M, (1700, 1300), borderMode=cv2.BORDER_CONSTANT, borderValue=(0.6,))
+    noise = np.random.default_rng(1).normal(0, 2, light.shape)
+    (grid,) = find_grids(np.clip(30 + 200 * light + noise, 0, 255).astype(np.uint8), [(9, 6)])
+    assert np.isfinite(grid.pixels[..., 0]).sum() >= 53
+    corner = M @ [8.0 * side - 0.5, 8.0 * side - 0.5, 1]
+    assert np.nanmin(np.hypot(*(grid.pixels - corner).reshape(-1, 2).T)) < 0.5
