@@ -283,7 +283,7 @@ def other_target(grey: NDArray[np.generic]) -> str:
 
 def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
     """Reduce a large image, to 8 bits as well."""
-    while max(grey.shape) >= 2 * _LONGEST:  # exact halves are fast
+    while max(grey.shape) >= 2 * _LONGEST and min(grey.shape) > 1:  # exact halves are fast
         even = np.ascontiguousarray(grey[: len(grey) // 2 * 2, : grey.shape[1] // 2 * 2])
         grey = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     scale = min(1.0, _LONGEST / max(grey.shape))

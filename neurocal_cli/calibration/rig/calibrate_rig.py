@@ -32,7 +32,6 @@ _SIDES = ("left", "right")
 
 
 _ROUNDS = 2  # rounds of selecting lenses and target alternately
-_NEAR = 0.3  # standard deviations of its points, rms: the lenses are not selected again for such a target
 _OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
@@ -96,24 +95,26 @@ def cameras_on_one_target(
         own = {"camera_name": name, **options[name], "target": target, "preferred": preferred}
         return calibrate(points[name], **own, progress=_named(progress, name))
 
+    def calibrated(target: str | Target) -> list[Calibration]:
+        cameras = [camera(name, target) for name in names]
+        for k, model in _likely_models(cameras):
+            alike = camera(names[k], target, model)
+            if alike.distortion_model == model:
+                cameras[k] = alike
+                if len(cameras) == 2:
+                    break
+        return cameras
+
     surveyed = any(one.world_std is not None for one in points.values())
-    on: str | Target = choice if surveyed else "given"
-    cameras = [camera(name, on) for name in names]
+    cameras = calibrated(choice if surveyed else "given")
     for _ in range(_ROUNDS):
         target = common_target(cameras, choice)
-        if target is None or (isinstance(on, Target) and _is_near(target, on)):
+        if target is None:
             break
-        on, before = target, [camera.distortion_model for camera in cameras]
-        cameras = [camera(name, on) for name in names]
+        before = [camera.distortion_model for camera in cameras]
+        cameras = calibrated(target)
         if [camera.distortion_model for camera in cameras] == before:
             break
-    # On the last target alone: another one makes lenses look different.
-    for k, model in _likely_models(cameras):
-        alike = camera(names[k], on, model)
-        if alike.distortion_model == model:
-            cameras[k] = alike
-            if len(cameras) == 2:
-                break
     kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
     return SeveralCameras(dict(zip(names, _with_one_target(cameras), strict=True)), kept)
 
@@ -121,22 +122,18 @@ def cameras_on_one_target(
 def _with_one_target(cameras: Sequence[Calibration]) -> list[Calibration]:
     """The cameras, holding one target where theirs are equal."""
     first = cameras[0].target
-    if first is None:
-        return list(cameras)
     return [
-        replace(camera, target=first)
-        if camera.target is not None
-        and np.array_equal(first.given, camera.target.given)
-        and np.array_equal(first.found, camera.target.found)
-        else camera
+        replace(camera, target=first) if first is not None and _is_equal(first, camera.target) else camera
         for camera in cameras
     ]
 
 
-def _is_near(one: Target, other: Target) -> bool:
-    """Whether the points of two estimates of a target differ far less than they are uncertain."""
-    move = (one.found - other.found) / np.maximum(one.std, 1e-300)
-    return bool(np.sqrt((move**2).mean()) < _NEAR)
+def _is_equal(one: Target, other: Target | None) -> bool:
+    return (
+        other is not None
+        and np.array_equal(one.given, other.given)
+        and np.array_equal(one.found, other.found)
+    )
 
 
 def _likely_models(cameras: Sequence[Calibration]) -> list[tuple[int, str]]:
