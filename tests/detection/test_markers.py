@@ -56,6 +56,19 @@ def test_charuco_vertices_are_measured_to_the_bound_of_plain_squares() -> None:
     assert found.notes == ("the markers are of DICT_4X4_50",)
 
 
+@pytest.mark.parametrize(("seed", "shift"), [(702, (-87.9, 149.4)), (703, (-217.7, 128.5))])
+def test_a_small_part_of_a_board_through_a_lens_is_measured_to_the_bound(
+    seed: int, shift: tuple[float, float]
+) -> None:
+    plane = plane_of("charuco:8x8:25.4:19.05:DICT_4X4_50")
+    scene = marked_scene(plane, seed, square=74.0, tilt=35.0, noise=3.0, psf=0.9, k1=-0.1, shift=shift)
+    picture = taken(scene, 1, 8)
+    error, squared = errors_of(detect_points(picture.image, scene.board, "vertices"), picture)
+    assert 8 <= len(error) <= 16
+    assert np.sqrt((error**2).mean()) < 0.007
+    assert squared.mean() < 1.6
+
+
 def test_blurred_markers_near_the_edges_do_not_move_them() -> None:
     scene = marked_scene(plane_of(CHARUCO), 2, psf=1.6)
     picture = taken(scene, 2, 4)
