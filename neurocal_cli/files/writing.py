@@ -21,7 +21,7 @@ import sys
 from binascii import crc32
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from contextvars import Context, ContextVar
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from typing import IO
@@ -87,7 +87,11 @@ def write_at_once(path: str | Path, content: str | bytes) -> None:
 
     Such a file is no output of the command: a cache, or a frame of a video that is read back.
     """
-    Context().run(write_whole, path, content)  # an empty context has no `Outputs`
+    token = _CURRENT.set(None)
+    try:
+        write_whole(path, content)
+    finally:
+        _CURRENT.reset(token)
 
 
 def make_folder(folder: str) -> None:
