@@ -229,10 +229,10 @@ def test_a_dictionary_of_mtx_and_dist_is_a_camera(key: str, tmp_path: Path) -> N
 
 REFUSED = {
     '{"K": [600, 0, 320, 0, 600, 240, 0, 0, 1], "lens_dist": [1, 2]}': "the key 'lens_dist' may be the dist",
-    "cam0: {camera_model: pinhole-fov, intrinsics: [1, 1, 1, 1]}": "model 'pinhole-fov' is not known",
-    "cam0: {camera_model: ds, distortion_model: radtan, intrinsics: [1, 1, 1, 1, 1, 1]}": "'radtan' is not",
+    "cam0: {camera_model: pinhole-fov, intrinsics: [1, 1, 1, 1]}": "model 'pinhole-fov' of Kalibr is not",
+    "cam0: {camera_model: ds, distortion_model: radtan, intrinsics: [1, 1, 1, 1, 1, 1]}": "'ds-radtan' of",
     "cam0: {camera_model: omni, distortion_model: none, intrinsics: [1, 1, 1, 1]}": "intrinsics",
-    KALIBR.replace("radtan", "fov"): "the distortion model 'fov' is not known",
+    KALIBR.replace("radtan", "fov"): "the model 'pinhole-fov' of Kalibr is not known",
     "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0}\nmodel: kannala_brandt\n": "'kannala_brandt'",
     "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0}\nmirror_offset: 1.2": "mirror_offset'",
     "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1.2}": "has xi of an omnidirectional camera without its distortion",
@@ -241,7 +241,7 @@ REFUSED = {
     "1 THIN_PRISM_FISHEYE 640 480 1 2 3\n": ":1: the camera model 'THIN_PRISM_FISHEYE' is not known",
     "# a list\n1 OPENCV 640 480 1 2 3\n": ":2: is not the line of a camera with the model OPENCV",
     "1 PINHOLE 640 480 1 2 3 4\n2 PINHOLE 640 480 1 2 3 4\n": "holds 2 cameras, but not their relative poses",
-    "{ 'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [1] }": "the lens model 'CAHVOR' is not known",
+    "{ 'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [1] }": "of mrcal is not known; convert it by mrcal",
     "{ 'lensmodel': __import__('os') }": "is not a camera model of mrcal",
     "M1: [1,0,1,0,1,1,0,0,1]\nM2: [1,0,1,0,1,1,0,0,1]\n": "holds two cameras, but not their relative pose",
 }

@@ -1,15 +1,12 @@
 """Tables of the keys of one camera in a program's files, by which it is read and written.
 
-A path is a chain of keys joined by ``/``; numbers index lists. A path of several numbers ends in the form in
-which they are written: ``:list``, ``:matrix`` of nested rows, ``:data`` in ``{rows, cols, data}``, or
-``:column``. Any form is read. The trees are written as JSON, YAML or TOML.
+The paths of the keys are those of `tree_paths`.
 """
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
@@ -18,16 +15,13 @@ import numpy as np
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import with_model
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_tree import from_ros, matrix_data
+from neurocal_cli.files.camera_tree import from_ros
 from neurocal_cli.files.exchange.camera_names import have_gap, matrix_of, may_be_distortion
-from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.tree_paths import at, find, numbers, numbers_at, put, split
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import flow, number, text
 
 NOTHING = "-"  # the place of a coefficient that a program does not have
 _POLYNOMIAL = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted")
@@ -50,7 +44,7 @@ class CameraKeys:
     program: str
     intrinsics: tuple[str, ...]  # fx, fy, cx, cy, or one path of them or of the camera matrix
     lenses: tuple[Lens, ...]  # of several with one name, the last has the coefficients of the others
-    model: str = ""  # path of the name of the lens; without it, the first lens
+    model: str = ""  # path of the name of the lens, or of its parts; without it, the first lens
     size: tuple[str, ...] = ()  # width and height, or one path of both
     name: str = ""
     skew: str = ""
@@ -59,27 +53,28 @@ class CameraKeys:
     optional: str = ""  # which coefficients a file may lack: all at once, or any
     aside: tuple[str, ...] = ()  # other numbers beside those of the camera
     complete: bool = False  # whether there are no others
+    advice: str = "calibrate it as"  # what to do with a camera of another model: this, one of them
 
     @property
     def models(self) -> tuple[str, ...]:
         """Our names of the models that can be written, the simplest first."""
         ours = [lens.ours for lens in self.lenses]
-        plain = [] if ours[0] not in _POLYNOMIAL or "none" in ours else ["none"]
+        plain = [] if set(ours).isdisjoint(_POLYNOMIAL) else ["none"]
         return tuple(dict.fromkeys([*plain, *ours]))
 
     def camera(self, root: Field, name: str = "camera") -> Camera:
         """Read a camera."""
         lens = self._lens(root)
-        values = [at(root, path) for path in lens.intrinsics or self.intrinsics]
-        if len(values) == 1:
-            entries = numbers(values[0])
+        paths = lens.intrinsics or self.intrinsics
+        if len(paths) == 1:
+            entries = numbers_at(root, paths[0])
             if len(entries) not in (4, 9):
-                values[0].fail("four numbers or a 3 x 3 matrix")
+                at(root, paths[0]).fail("four numbers or a 3 x 3 matrix")
             K = matrix_of(*entries) if len(entries) == 4 else entries.reshape(3, 3).copy()
             if not np.array_equal(K[2], [0, 0, 1]):
-                values[0].fail("a 3 x 3 matrix whose last row is 0, 0, 1")
+                at(root, paths[0]).fail("a 3 x 3 matrix whose last row is 0, 0, 1")
         else:
-            K = matrix_of(*(value.number() for value in values))
+            K = matrix_of(*(at(root, path).number() for path in paths))
         if self.skew and (skew := find(root, self.skew)) is not None:
             K[0, 1] = skew.number()
         K[:2, 2] -= self.first_pixel
@@ -100,26 +95,28 @@ class CameraKeys:
         return (width, height) if width and height else None
 
     def _lens(self, root: Field) -> Lens:
-        stated = find(root, self.model) if self.model else None
-        if stated is None:
-            first = self._last(self.lenses[0])
+        stated = [entry.text() for path in split(self.model) if (entry := find(root, path)) is not None]
+        if not stated:
+            first = self._fullest(root, self.lenses[0])
             others = [one for one in self.lenses if one.ours != first.ours and one.places == first.places]
             if self.model and others and first.places:
-                at(root, self.model)  # the same numbers may be those of either
+                at(root, split(self.model)[0])  # the same numbers may be those of either
             return first
-        word = _plain(stated.text())
+        word = _plain("".join(stated))
         for lens in self.lenses:
             if word in map(_plain, lens.words):
-                return self._last(lens)
+                return self._fullest(root, lens)
         known = ", ".join(dict.fromkeys(lens.words[0] for lens in self.lenses))
         raise InputError(
-            f"the model {stated.text()[:40]!r} of {self.program} is not known; calibrate it as one of {known}"
-            ", or with neurocal from the points"
+            f"the model {'-'.join(stated)[:40]!r} of {self.program} is not known; {self.advice} one of "
+            f"{known}, or calibrate with neurocal from the points"
         )
 
-    def _last(self, lens: Lens) -> Lens:
-        """The lens of the same names with the most coefficients."""
-        return [other for other in self.lenses if other.words == lens.words][-1]
+    def _fullest(self, root: Field, lens: Lens) -> Lens:
+        """The lens of the same names with the most coefficients, if possible of those that are there."""
+        alike = [other for other in self.lenses if other.words == lens.words]
+        there = [one for one in alike if all(path == NOTHING or find(root, path) for path in one.places)]
+        return (there or alike)[-1]
 
     def _distortion(self, root: Field, lens: Lens) -> Distortion:
         count = len(MODELS[lens.ours])
@@ -145,8 +142,12 @@ class CameraKeys:
                 [0.0 if (one := fields.get(path)) is None else one.number() for path in lens.places]
             )
         self._refuse_others(root, lens, self.complete or lacking)
+        if lens.ours in _POLYNOMIAL[:4] and len(values) == count and values.any():
+            return Distortion(lens.ours, values)
         if lens.ours in _POLYNOMIAL:
             return Distortion(*from_ros("plumb_bob", np.pad(values, (0, max(0, 5 - len(values))))))
+        if not values[count:].any():
+            values = values[:count]
         if len(values) != count:
             raise InputError(
                 f"the model {lens.words[0]} has {count} coefficients, found {len(values)}; correct it"
@@ -158,17 +159,18 @@ class CameraKeys:
 
         If `every`, because a coefficient is missing, each number may be it.
         """
-        paths = [*self.intrinsics, *lens.intrinsics, *lens.places, *self.size, *self.constants]
-        paths = [path.partition(":")[0] for path in (*paths, self.model, self.name, self.skew) if path]
-        others = [one for one in self.lenses if one.ours not in (lens.ours, "none")]
-        words = {_plain(word) for one in others for word in one.words if len(word) > 2}
+        numbered = *self.intrinsics, *lens.intrinsics, *lens.places
+        others = *self.size, *self.constants, *split(self.model), self.name, self.skew
+        paths = [path.partition(":")[0] for path in (*numbered, *others) if path]
+        different = [one for one in self.lenses if one.ours not in (lens.ours, "none")]
+        words = {_plain(word) for one in different for word in one.words if len(word) > 2}
         for folder in dict.fromkeys(["", *(path.rpartition("/")[0] for path in paths)]):
             parent = find(root, folder) if folder else root
             start = f"{folder}/" if folder else ""
             known = {path.removeprefix(start).partition("/")[0] for path in paths if path.startswith(start)}
             stems = {key.rpartition(".")[0] for key in known}
             value, listed = None if parent is None else parent.value, False
-            if isinstance(value, list) and any(place.startswith(start) for place in lens.places):
+            if isinstance(value, list) and any(path.startswith(start) for path in numbered):
                 value, listed = {str(k): entry for k, entry in enumerate(value)}, True
             for key, entry in value.items() if isinstance(value, dict) else ():
                 stem, _, last = key.rpartition(".")
@@ -197,13 +199,13 @@ class CameraKeys:
         for path, value in self.constants.items():
             put(tree, path, value)
         if self.model:
-            put(tree, self.model, lens.words[0])
+            put(tree, self.model, lens.words[0].split("-") if "," in self.model else lens.words[0])
         if self.name:
             put(tree, self.name, camera.name)
         if self.size:
             _put_all(tree, self.size, camera.image_size or (0, 0))
         paths = lens.intrinsics or self.intrinsics
-        if paths[0].endswith((":matrix", ":data")):
+        if ":" in paths[0] and not paths[0].endswith((":list", ":column")):
             put(tree, paths[0], matrix_of(a, b, u0, v0, skew))
         else:
             _put_all(tree, paths, [a, b, u0, v0])
@@ -218,135 +220,14 @@ def _put_all(tree: dict[str, Any], paths: tuple[str, ...], values: Any) -> None:
         put(tree, paths[0], np.array(values) if ":" in paths[0] and "list" not in paths[0] else list(values))
     else:
         for path, value in zip(paths, values, strict=True):
-            put(tree, path, value)
+            if path != NOTHING:
+                put(tree, path, value)
 
 
 def _plain(word: str) -> str:
     return re.sub(r"[^a-z0-9]", "", word.lower())
 
 
-def find(root: Field, path: str) -> Field | None:
-    """Value at a path; None if it is not there, or null."""
-    here = root
-    for key in path.partition(":")[0].split("/"):
-        if isinstance(here.value, list) and key.isdecimal() and int(key) < len(here.value):
-            here = Field(here.value[int(key)], here.source, f"{here.path}[{key}]")
-        elif key in here:
-            here = here[key]
-        else:
-            return None
-    return here
-
-
-def at(root: Field, path: str) -> Field:
-    """Value at a path; a FormatError names the first key that is missing."""
-    here = root
-    for key in path.partition(":")[0].split("/"):
-        if isinstance(here.value, list):
-            found = find(here, key)
-            if found is None:
-                here.fail(
-                    f"a list of {int(key) + 1} or more" if key.isdecimal() else "a mapping (key: value)"
-                )
-            here = found
-        else:
-            here = here[key]
-    return here
-
-
-def numbers(entry: Field, count: int = -1) -> Array:
-    """Numbers in a list, in nested lists or in ``{rows, cols, data}``, in one row."""
-    if isinstance(entry.value, dict) and "rows" not in entry.value:
-        return entry["data"].array(count)
-    return matrix_data(entry, count)
-
-
-def transform(entry: Field) -> Pose:
-    """A pose from its matrix of 4 x 4 or 3 x 4 numbers, in any form."""
-    values = numbers(entry)
-    if len(values) not in (12, 16):
-        entry.fail("4 x 4 numbers")
-    T = values.reshape(-1, 4)
-    return Pose(T[:3, :3], T[:3, 3])
-
-
-def put(tree: dict[str, Any], path: str, value: Any) -> None:
-    """Set the value at a path, in the form that its end names."""
-    path, _, form = path.partition(":")
-    *folders, key = path.split("/")
-    for folder in folders:
-        tree = tree.setdefault(folder, {})
-    if form in ("data", "column"):
-        matrix = np.atleast_2d(value) if form == "data" else np.reshape(value, (-1, 1))
-        value = {"rows": matrix.shape[0], "cols": matrix.shape[1], "data": matrix.ravel().tolist()}
-    elif isinstance(value, np.ndarray):
-        value = value.tolist()
-    tree[key] = value
-
-
 K4 = ("k1", "k2", "k3", "k4")
 RADTAN = ("k1", "k2", "p1", "p2")
 FIVE, EIGHT = (*RADTAN, "k3"), (*RADTAN, "k3", "k4", "k5", "k6")
-
-
-def under(prefix: str, *names: str) -> tuple[str, ...]:
-    """Paths of names that begin alike."""
-    return tuple(prefix + name for name in names)
-
-
-# Writing trees.
-
-
-def json_text(tree: Any) -> str:
-    """A tree as JSON."""
-    return json.dumps(tree, indent=1, allow_nan=False) + "\n"
-
-
-def yaml_text(tree: Mapping[str, Any], head: str = "") -> str:
-    """A tree as YAML, below the lines `head`."""
-    return head + "".join(f"{line}\n" for line in _yaml_lines(tree))
-
-
-def _yaml_lines(tree: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            lines += [f"{key}:", *(f"   {line}" for line in _yaml_lines(value))]
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            lines.append(f"{key}:")
-            for entry in value:
-                first, *rest = _yaml_lines(entry)
-                lines += [f" - {first}", *(f"   {line}" for line in rest)]
-        else:
-            lines.append(f"{key}: {_yaml_value(value)}")
-    return lines
-
-
-def _yaml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (int, str)):
-        return str(value) if isinstance(value, int) else text(value)
-    if isinstance(value, list) and all(isinstance(entry, int) for entry in value):
-        return str(value)
-    return number(value) if isinstance(value, float) else flow(np.array(value))
-
-
-def toml_text(tables: Mapping[str, Mapping[str, Any]]) -> str:
-    """Tables of texts, numbers and lists as TOML."""
-    parts = []
-    for name, table in tables.items():
-        parts += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items()), ""]
-    return "\n".join(parts)
-
-
-def single(
-    keys: CameraKeys, write: Callable[[dict[str, Any]], str]
-) -> Callable[[CameraSet, str], dict[str, str | bytes]]:
-    """The writer of a format with one camera and nothing else."""
-    return lambda cameras, _: {"": write(keys.tree(cameras.cameras[0]))}
-
-
-def one(keys: CameraKeys) -> Callable[[Document], CameraSet]:
-    """The reader of a format with one camera and nothing else."""
-    return lambda document: CameraSet((keys.camera(document.root),), program=keys.program)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.exchange.document import Document
 
 _FILM = float(np.hypot(36.0, 24.0))  # diagonal [mm]
+STILL = Pose(np.eye(3), np.zeros(3))
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 
 
@@ -55,7 +56,7 @@ class CameraSet:
     @property
     def mounted(self) -> tuple[Pose, ...]:
         """Poses from the first camera to each of them."""
-        return (Pose(np.eye(3), np.zeros(3)), *self.relative)
+        return (STILL, *self.relative)
 
     @property
     def has_lengths(self) -> bool:

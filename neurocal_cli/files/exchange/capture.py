@@ -17,39 +17,30 @@ import numpy as np
 
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_tree import matrix_data
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, numbers, toml_text
-from neurocal_cli.files.exchange.camera_set import (
-    CameraSet,
-    Format,
-    after,
-    from_vector,
-    mounted,
-    to_vector,
-)
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.tree_paths import toml_text
 from neurocal_cli.files.tree_fields import Field
 
 # anipose, freemocap and caliscope: TOML with a section for each camera, posed from the world to the camera.
-_ANIPOSE = CameraKeys(
-    "anipose",
+_CALISCOPE = CameraKeys(
+    "caliscope",
     ("matrix:matrix",),
     (Lens(("false",), "plumb_bob", ("distortions",)), Lens(("true",), "fisheye", ("distortions",))),
+    model="fisheye",
     size=("size",),
-    name="name",
 )
-_ANIPOSE_FISHEYE = replace(_ANIPOSE, lenses=_ANIPOSE.lenses[1:])
+_ANIPOSE = replace(_CALISCOPE, program="anipose", name="name")
 
 
-def _anipose_parts(document: Document) -> dict[str, Field]:
+def _sections(document: Document) -> dict[str, Field]:
     """Sections of cameras, by name."""
-    tree = document.tree
-    below = tree.get("cameras")
-    sections = below if isinstance(below, dict) else tree
-    root = Field(sections, document.source)
+    below = document.tree.get("cameras")
+    sections = below if isinstance(below, dict) else document.tree
+    root = Field(sections, document.source, "cameras" if isinstance(below, dict) else "")
     return {
         key: root[key]
         for key, one in sections.items()
@@ -57,74 +48,52 @@ def _anipose_parts(document: Document) -> dict[str, Field]:
     }
 
 
-def _read_anipose(document: Document) -> CameraSet:
-    caliscope = "cameras" in document.tree
-    cameras, poses = [], []
-    for key, part in _anipose_parts(document).items():
+def _anipose_parts(document: Document) -> dict[str, Field]:
+    parts = {}
+    for key, part in _sections(document).items():
         if part.get("ignore", False).value is True:
             document.notes.append(f"{document.source}: {key} is to be ignored, and is left out")
             continue
-        fisheye = part.get("fisheye", False).boolean()
         if "fisheye" not in part and len(part["distortions"].array(-1)) == len(MODELS["fisheye"]):
             part.refuse(f"{key} has four coefficients; say fisheye = true, or false, for it")
-        keys = _ANIPOSE_FISHEYE if fisheye else _ANIPOSE
-        cameras.append(keys.camera(part, f"cam_{key}" if key.isdecimal() else key))
-        pose = None
-        if "rotation" in part and "translation" in part:
-            R = numbers(part["rotation"])
-            pose = Pose(
-                R.reshape(3, 3) if len(R) == 9 else from_vector(part["rotation"].array(3)),
-                part["translation"].array(3),
-            )
-        poses.append(pose)
-    if not cameras:
+        fisheye = str(part.get("fisheye", False).boolean()).lower()
+        name = f"cam_{key}" if key.isdecimal() else key
+        parts[name] = Field({**part.value, "fisheye": fisheye}, part.source, part.path)
+    if not parts:
         raise InputError("all cameras are to be ignored; set ignore = false for one")
-    return mounted(
-        cameras, poses, "caliscope" if caliscope else "anipose", "m" if caliscope else None, "world"
-    )
+    return parts
 
 
-def _anipose_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    tables = {}
-    for k, (camera, pose) in enumerate(zip(cameras.cameras, cameras.mounted, strict=True)):
-        fisheye = camera.distortion.model == "fisheye"
-        tree = (_ANIPOSE_FISHEYE if fisheye else _ANIPOSE).tree(camera)
-        placed = {"rotation": to_vector(pose.R).tolist(), "translation": pose.t.tolist()}
-        tables[f"cam_{k}"] = {**tree, **placed, "fisheye": fisheye}
-    return {"": toml_text({**tables, "metadata": {"adjusted": False}})}
+def _sections_of(start: str, trees: list[Tree], **own: object) -> Tree:
+    """The cameras as sections; in caliscope's `own` keys is the number of each."""
+    return {
+        f"{start}{k}": {**tree, "fisheye": tree["fisheye"] == "true", **own, **({"cam_id": k} if own else {})}
+        for k, tree in enumerate(trees)
+    }
 
 
-def _caliscope_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    tables = {}
-    for k, (camera, pose) in enumerate(zip(cameras.cameras, cameras.mounted, strict=True)):
-        fisheye = camera.distortion.model == "fisheye"
-        tree = (_ANIPOSE_FISHEYE if fisheye else _ANIPOSE).tree(camera)
-        tree.pop("name", None)
-        placed = {"translation": pose.t.tolist(), "rotation": pose.R.tolist()}
-        own = {"cam_id": k, "rotation_count": 0, "ignore": False, "fisheye": fisheye}
-        tables[f"cameras.{k}"] = {**own, **tree, **placed}
-    return {"": toml_text(tables)}
-
-
-ANIPOSE = Format(
-    "anipose",
-    ("none", "plumb_bob", "fisheye"),
-    _anipose_text,
-    lambda document: bool(_anipose_parts(document)),
-    _read_anipose,
-    files="calibration.toml of anipose, freemocap",
+ANIPOSE = table(
+    _ANIPOSE,
+    _sections,
+    "calibration.toml of anipose, freemocap",
+    parts=_anipose_parts,
+    pose=PoseKeys(("rotation:vector", "translation"), frame="world"),
+    unit=None,
+    write=toml_text,
+    whole=lambda trees, cameras: {**_sections_of("cam_", trees), "metadata": {"adjusted": False}},
     skew=True,
     most_cameras=99,
     needs_size=True,
     rig="`rotation, translation` from the world to each camera",
 )
-CALISCOPE = Format(
-    "caliscope",
-    ("none", "plumb_bob", "fisheye"),
-    _caliscope_text,
-    lambda document: "cameras" in document.tree and bool(_anipose_parts(document)),
-    _read_anipose,
-    files="camera_array.toml of caliscope",
+CALISCOPE = table(
+    _CALISCOPE,
+    lambda document: "cameras" in document.tree and _sections(document),
+    "camera_array.toml of caliscope",
+    parts=_anipose_parts,
+    pose=PoseKeys(("rotation", "translation"), frame="world"),
+    write=toml_text,
+    whole=lambda trees, cameras: _sections_of("cameras.", trees, rotation_count=0, ignore=False),
     skew=True,
     most_cameras=99,
     metres=True,
@@ -142,27 +111,27 @@ def easymocap_names(document: Document) -> list[str]:
     return found if found and {f"K_{found[0]}", f"T_{found[0]}"} & set(document.tree) else []
 
 
-def _read_easymocap(document: Document) -> CameraSet:
+def _easymocap_parts(document: Document) -> dict[str, Field]:
     names, root = easymocap_names(document), document.root
     if f"K_{names[0]}" not in root or (len(names) > 1 and f"T_{names[0]}" not in root):
         raise InputError("is one of the two files of EasyMocap; give intri.yml and extri.yml")
-    cameras, poses = [], []
-    for name in names:
-        part = {key: root[f"{word}_{name}"].value for key, word in (("K", "K"), ("D", "dist"))}
-        keys = LooseKeys(Field(part, root.source), document.distortion or "plumb_bob")
-        cameras.append(keys.camera(name=name))
-        if f"T_{name}" in root:
-            R = matrix_data(root[f"Rot_{name}"], 9).reshape(3, 3)
-            poses.append(Pose(R, matrix_data(root[f"T_{name}"], 3)))
-    return mounted(cameras, poses or [None], "EasyMocap", "m", "world")
+    keys, model = ("K", "dist", "Rot", "T"), "fisheye" if document.distortion == "fisheye" else ""
+    return {
+        name: Field(
+            {"model": model} | {key: root[f"{key}_{name}"].value for key in keys if f"{key}_{name}" in root},
+            root.source,
+        )
+        for name in names
+    }
 
 
-EASYMOCAP = Format(
-    "EasyMocap",
-    ("none", "plumb_bob"),
-    matches=lambda document: bool(easymocap_names(document)),
-    read=_read_easymocap,
-    files="intri.yml and extri.yml",
+_OF_EASYMOCAP = (Lens(("",), "plumb_bob", ("dist",)), Lens(("fisheye",), "fisheye", ("dist",)))
+EASYMOCAP = table(
+    CameraKeys("EasyMocap", ("K:data",), _OF_EASYMOCAP, model="model"),
+    easymocap_names,
+    "intri.yml and extri.yml",
+    parts=_easymocap_parts,
+    pose=PoseKeys(("Rot", "T"), frame="world"),
     most_cameras=99,
     rig="`Rot_`, `T_` from the world to each camera",
 )

@@ -25,7 +25,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.reconstruction import only
+from neurocal_cli.files.exchange.format_table import only
 from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.yaml_text import number
 
@@ -123,7 +123,7 @@ def read_file(document: Document) -> CameraSet:
         words = ["1", stated, *map(str, sides), *map(repr, document.root["params"].array(-1).tolist())]
         return CameraSet((_camera(words, source, 1),), program="COLMAP")
     if (sensors := _sensors(document)) is not None:
-        return only(sensors.values(), sensors, "kapture")
+        return only(list(sensors.values()), sensors, "kapture")
     lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
     return CameraSet(tuple(_cameras(lines, source).values()), program="COLMAP")
 

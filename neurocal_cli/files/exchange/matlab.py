@@ -19,21 +19,44 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import MODELS, Distortion
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange import dictionary
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_names import matrix_of
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, Document, assignments
+from neurocal_cli.files.exchange.format_table import PoseKeys
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.exchange.tree_paths import numbers_at, under
 from neurocal_cli.files.tree_fields import Field
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
 _INTRINSICS = {"FocalLength", "PrincipalPoint", "RadialDistortion"}  # of cameraIntrinsics
-_CAMERAS = ({"IntrinsicMatrix"}, _INTRINSICS, {"K", "RadialDistortion"})
+_CAMERAS = ({"IntrinsicMatrix"}, _INTRINSICS, {"K", "RadialDistortion"}, {"K", "RDistort", "TDistort"})
 STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
+
+_RADIAL, _TANGENTIAL = under("RadialDistortion/", "0", "1", "2"), under("TangentialDistortion/", "0", "1")
+_PARAMETERS = CameraKeys(
+    "MATLAB",
+    ("IntrinsicMatrix:transposed",),
+    (
+        Lens(("",), "k1k2p1p2", (*_RADIAL[:2], *_TANGENTIAL)),
+        Lens(("",), "plumb_bob", (*_RADIAL[:2], *_TANGENTIAL, _RADIAL[2])),
+    ),
+    size=("ImageSize/1", "ImageSize/0"),
+    first_pixel=FIRST_PIXEL,
+    optional="all",
+)
+_SECOND = PoseKeys(("RotationOfCamera2:transposed", "TranslationOfCamera2"))
+_BOUGUET = CameraKeys(
+    "MATLAB",
+    ("fc/0", "fc/1", "cc/0", "cc/1"),
+    (Lens(("",), "plumb_bob", under("kc/", *"01234")),),
+    size=("nx", "ny"),
+    skew="skew",
+)
+_RIGHT = PoseKeys(("om", "T"))
 
 _SCRIPT = re.compile(r"^\s*fc(_left)?\s*=\s*\[", re.MULTILINE).search
 _ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
@@ -69,30 +92,33 @@ def read(document: Document) -> CameraSet:
         if isinstance(tree.get(name), dict):
             tree = tree[name]
             break
-    if "fc" in tree:
-        return CameraSet((_bouguet(tree, ""),), (), _bouguet_poses(tree), program="MATLAB")
-    if "fc_left" in tree and "fc_right" in tree:
-        pose = Pose(from_vector(_numbers(tree, "om", 3)), _numbers(tree, "T", 3))
-        return CameraSet((_bouguet(tree, "_left"), _bouguet(tree, "_right")), (pose,), program="MATLAB")
-    if "CameraParameters1" in tree and "CameraParameters2" in tree:
-        R = _numbers(tree, "RotationOfCamera2", 9).reshape(3, 3).T
-        pose = Pose(R, _numbers(tree, "TranslationOfCamera2", 3))
-        parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
-        cameras = _camera(parts[0]), _camera(parts[1])
-        return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
-    if {"K", "RDistort", "TDistort"} <= set(tree):  # DANNCE's Label3D
-        tree = {"IntrinsicMatrix": tree["K"], "RadialDistortion": tree["RDistort"],
-                "TangentialDistortion": tree["TDistort"]}  # fmt: skip
-    if any(keys <= set(tree) for keys in _CAMERAS):
-        return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
+    root = Field(_plain(tree), document.source)
+    sides = [side for side in ("", "_left", "_right") if f"fc{side}" in root]
+    if sides in ([""], ["_left", "_right"]):
+        cameras = tuple(
+            _BOUGUET.camera(_bouguet(root, side), side.removeprefix("_") or "camera") for side in sides
+        )
+        relative = [_RIGHT.read(root)] if len(sides) == 2 else []
+        poses = _bouguet_poses(tree) if len(sides) == 1 else {}
+        return CameraSet(cameras, tuple(filter(None, relative)), poses, program="MATLAB")
+    parts = [root[f"CameraParameters{k}"] for k in (1, 2) if f"CameraParameters{k}" in root]
+    if len(parts) == 2 or any(keys <= set(root.value) for keys in _CAMERAS):
+        placed = _SECOND.read(root) if len(parts) == 2 else None
+        parts = parts if len(parts) == 2 else [root]
+        return CameraSet(
+            tuple(_PARAMETERS.camera(_struct(part)) for part in parts),
+            () if placed is None else (placed,),
+            _poses(parts[0].value),
+            unit_of(parts[0].value),
+            program="MATLAB",
+        )
     if any(re.fullmatch(r"x_\d+", name) for name in tree):
         raise InputError(
             "holds points of Bouguet's toolbox, and no camera; give it to convert without --what"
         )
-    plain = Field({name: _plain(value) for name, value in tree.items()}, document.source)
-    if LooseKeys(plain).has_camera():  # saved by Python, or of mexopencv
+    if LooseKeys(root).has_camera():  # saved by Python, or of mexopencv
         document.warnings.append(f"{document.source}: {FROM_ZERO}")
-        return dictionary.from_tree(plain, document)
+        return dictionary.from_tree(root, document)
     raise InputError(
         "holds no camera that can be read, and objects of MATLAB's classes can be read by MATLAB only; "
         "there, save a struct: cameraParams = toStruct(cameraParams); "
@@ -101,38 +127,36 @@ def read(document: Document) -> CameraSet:
 
 
 def _plain(value: Any) -> Any:
+    """Nested lists for matrices, lists for rows and columns, and numbers for single ones."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
     if not isinstance(value, np.ndarray):
         return value
-    return float(value.item()) if value.size == 1 else value.tolist()
+    if value.size == 1:
+        return float(value.item())
+    return (value.ravel() if value.ndim == 2 and 1 in value.shape else value).tolist()
 
 
-def _camera(tree: dict[str, Any]) -> Camera:
-    if "IntrinsicMatrix" in tree:
-        K = _numbers(tree, "IntrinsicMatrix", 9).reshape(3, 3).T
-    elif "K" in tree:
-        K = _numbers(tree, "K", 9).reshape(3, 3)
-    else:
-        (fx, fy), (cx, cy) = _numbers(tree, "FocalLength", 2), _numbers(tree, "PrincipalPoint", 2)
-        skew = float(_numbers(tree, "Skew", 1)[0]) if "Skew" in tree else 0.0
-        K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    if "FocalLength" in tree and "PrincipalPoint" in tree:
-        stated = np.array([_numbers(tree, name, 2) for name in ("FocalLength", "PrincipalPoint")])
-        if np.abs(stated - [[K[0, 0], K[1, 1]], K[:2, 2]]).max() > _ROUNDED * K.max():
+def _struct(part: Field) -> Field:
+    """The struct of a camera as cameraParameters has it, from that of cameraIntrinsics as well."""
+    tree = dict(part.value)
+    if "RDistort" in tree:  # DANNCE's Label3D
+        tree = {"IntrinsicMatrix": tree["K"], "RadialDistortion": tree["RDistort"],
+                "TangentialDistortion": tree.get("TDistort")}  # fmt: skip
+    elif "IntrinsicMatrix" not in tree and "K" in tree:
+        tree["IntrinsicMatrix"] = numbers_at(part, "K:transposed").tolist()
+    elif "IntrinsicMatrix" not in tree:
+        (fx, fy), (cx, cy) = part["FocalLength"].array(2), part["PrincipalPoint"].array(2)
+        tree["IntrinsicMatrix"] = matrix_of(fx, fy, cx, cy, part.get("Skew", 0.0).number()).T.tolist()
+    root = Field(tree, part.source, part.path)
+    if "FocalLength" in root and "PrincipalPoint" in root:
+        K = numbers_at(root, "IntrinsicMatrix:transposed")
+        stated = np.array([root[name].array(2) for name in ("FocalLength", "PrincipalPoint")]).ravel()
+        if len(K) == 9 and np.abs(stated - K[[0, 4, 2, 5]]).max() > _ROUNDED * K.max():
             raise InputError("FocalLength, PrincipalPoint and the matrix differ; correct the one edited")
-    K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
-    radial = _numbers(tree, "RadialDistortion")
-    tangential = _numbers(tree, "TangentialDistortion", 2)
-    if len(radial) not in (2, 3):
-        raise InputError("RadialDistortion must be 2 or 3 numbers; correct it")
-    k1, k2, k3 = [*radial, 0.0][:3]
-    k = np.array([k1, k2, *tangential, k3])
-    size = None
-    if "ImageSize" in tree and np.size(tree["ImageSize"]) == 2:
-        height, width = _numbers(tree, "ImageSize", 2)
-        size = int(width), int(height)
-    model = "plumb_bob" if k3 else "k1k2p1p2" if k.any() else "none"
-    lens = Distortion(model, k[: len(MODELS[model])])
-    return Camera(Intrinsics.from_matrix(K), lens, size)
+    for key in ("RadialDistortion", "TangentialDistortion"):
+        numbers_at(root, key)  # or it is missing
+    return root
 
 
 def _poses(tree: dict[str, Any]) -> dict[str, Pose]:
@@ -148,17 +172,12 @@ def _poses(tree: dict[str, Any]) -> dict[str, Pose]:
     return {name: Pose(R[:, :, k].T, t[k]) for k, name in enumerate(names)}
 
 
-def _bouguet(tree: dict[str, Any], side: str) -> Camera:
-    fx, fy = _numbers(tree, f"fc{side}", 2)
-    cx, cy = _numbers(tree, f"cc{side}", 2)
-    alpha = float(_numbers(tree, f"alpha_c{side}", 1)[0]) if f"alpha_c{side}" in tree else 0.0
-    k = _numbers(tree, f"kc{side}", 5)
-    size = None
-    if "nx" in tree and "ny" in tree:
-        size = int(_numbers(tree, "nx", 1)[0]), int(_numbers(tree, "ny", 1)[0])
-    K = np.array([[fx, alpha * fx, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    lens = Distortion("plumb_bob", k) if k.any() else Distortion()
-    return Camera(Intrinsics.from_matrix(K), lens, size, side.removeprefix("_") or "camera")
+def _bouguet(root: Field, side: str) -> Field:
+    """The part of one camera, whose skew is that of its matrix."""
+    part = {key: root[f"{key}{side}"].value for key in ("fc", "cc", "kc")}
+    part |= {key: root[key].value for key in ("nx", "ny") if key in root}
+    alpha = root.get(f"alpha_c{side}", 0.0).number()
+    return Field({**part, "skew": alpha * root[f"fc{side}"].array(2)[0]}, root.source)
 
 
 def _bouguet_poses(tree: dict[str, Any]) -> dict[str, Pose]:
@@ -171,18 +190,6 @@ def _bouguet_poses(tree: dict[str, Any]) -> dict[str, Pose]:
         if len(om) == len(t) == 3 and np.isfinite([om, t]).all():  # NaN for images left out
             poses[f"{k}"] = Pose(from_vector(om), t)
     return poses
-
-
-def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
-    if name not in tree:
-        raise InputError(f"the variable {name} is missing; save it as well")
-    try:
-        values = np.asarray(tree[name], dtype=float).ravel()
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be numbers; correct it") from error
-    if (count >= 0 and len(values) != count) or not np.isfinite(values).all():
-        raise InputError(f"{name} must be {count} finite numbers, found {len(values)}; correct it")
-    return values
 
 
 def unit_of(tree: dict[str, Any]) -> str | None:
@@ -293,7 +300,7 @@ def saved(tree: dict[str, Any]) -> bytes:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    structs = [_struct(camera, cameras.unit) for camera in cameras.cameras]
+    structs = [{**_PARAMETERS.tree(camera), "WorldUnits": cameras.unit or ""} for camera in cameras.cameras]
     if cameras.poses:
         poses = list(cameras.poses.values())
         structs[0] |= {
@@ -302,33 +309,27 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
             "ViewNames": np.array(list(cameras.poses), dtype=object),
         }
     if len(structs) == 1:
-        return {"": saved({"cameraParams": structs[0]})}
-    (pose,) = cameras.relative
-    tree = {
-        "CameraParameters1": structs[0],
-        "CameraParameters2": structs[1],
-        "RotationOfCamera2": pose.R.T,
-        "TranslationOfCamera2": pose.t[None],
-    }
-    return {"": saved({"stereoParams": tree})}
+        return {"": saved({"cameraParams": _arrays(structs[0])})}
+    tree: dict[str, Any] = {f"CameraParameters{k}": one for k, one in enumerate(structs, start=1)}
+    _SECOND.put(tree, cameras.relative[0])
+    return {"": saved({"stereoParams": _arrays(tree)})}
 
 
-def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
-    k1, k2, p1, p2, k3 = np.pad(camera.distortion.coefficients, (0, 5 - len(camera.distortion.coefficients)))
-    K = camera.A + np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
-    width, height = camera.image_size or (0, 0)
+def _arrays(tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree with matrices for lists; MATLAB's numbers are of double precision."""
     return {
-        "IntrinsicMatrix": K.T,
-        "RadialDistortion": np.array([[k1, k2, k3] if k3 else [k1, k2]]),
-        "TangentialDistortion": np.array([[p1, p2]]),
-        "ImageSize": np.array([[float(height), float(width)]]),
-        "WorldUnits": unit or "",
+        key: np.atleast_2d(np.array(value, dtype=float))
+        if isinstance(value, list)
+        else _arrays(value)
+        if isinstance(value, dict)
+        else value
+        for key, value in tree.items()
     }
 
 
 FORMAT = Format(
     "MATLAB",
-    ("none", "k1k2p1p2", "plumb_bob"),
+    _PARAMETERS.models,
     _text,
     matches,
     read,
@@ -336,6 +337,6 @@ FORMAT = Format(
     skew=True,
     poses=True,
     needs_size=True,
-    first_pixel=1.0,
+    first_pixel=FIRST_PIXEL,
     rig="`RotationOfCamera2`, transposed; `om, T` of Bouguet",
 )

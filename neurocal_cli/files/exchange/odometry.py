@@ -7,39 +7,15 @@ single camera becomes its view ``body``. The centre of the first pixel is (0, 0)
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import (
-    EIGHT,
-    FIVE,
-    K4,
-    RADTAN,
-    CameraKeys,
-    Lens,
-    find,
-    json_text,
-    one,
-    single,
-    transform,
-    under,
-    yaml_text,
-)
-from neurocal_cli.files.exchange.camera_set import (
-    CameraSet,
-    Format,
-    from_quaternion,
-    inverse,
-    mounted,
-    to_quaternion,
-)
+from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, K4, RADTAN, CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_set import STILL, CameraSet, mounted
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
 from neurocal_cli.files.exchange.nearest_lenses import fov
+from neurocal_cli.files.exchange.tree_paths import find, json_text, under, yaml_text
 from neurocal_cli.files.tree_fields import Field
 
 # ORB-SLAM2 and 3.
@@ -61,6 +37,14 @@ def _orb(camera: str, model: str = "type", sides: tuple[str, str] = ("width", "h
     )
 
 
+_LEFT, _RIGHT, _NEWER = _orb("Camera."), _orb("Camera2."), _orb("Camera1.")
+_FROM_RIGHT = PoseKeys(("Stereo.T_c1_c2",), back=True)
+
+
+def _storage(tree: Tree) -> str:
+    return yaml_text(tree, "%YAML:1.0\n---\n")
+
+
 def _read_orb(document: Document) -> CameraSet:
     root = document.root
     if "LEFT.K" in root:
@@ -72,12 +56,12 @@ def _read_orb(document: Document) -> CameraSet:
         if find(root, f"{start}model") is not None:
             keys = _orb(start, "model", ("cols", "rows"))
             return CameraSet((keys.camera(root),), program=keys.program)
-    first = _orb("Camera1." if "Camera1.fx" in root else "Camera.").camera(root)
+    first = _NEWER if "Camera1.fx" in root else _LEFT
     if "Camera2.fx" not in root:
-        return CameraSet((first,), program="ORB-SLAM")
-    second = _orb("Camera2.").camera(root, "right")
-    poses = [Pose(np.eye(3), np.zeros(3)), inverse(transform(root["Stereo.T_c1_c2"]))]
-    return mounted([replace(first, name="left"), second], poses, "ORB-SLAM")
+        return CameraSet((first.camera(root),), program="ORB-SLAM")
+    root["Stereo.T_c1_c2"]
+    cameras = first.camera(root, "left"), _RIGHT.camera(root, "right")
+    return mounted(cameras, [STILL, _FROM_RIGHT.read(root)], "ORB-SLAM")
 
 
 def _is_orb(document: Document) -> bool:
@@ -87,13 +71,12 @@ def _is_orb(document: Document) -> bool:
     return nested or not {"Camera.fx", "Camera1.fx", "Camera.model"}.isdisjoint(tree)
 
 
-ORB_SLAM = Format(
-    "ORB-SLAM",
-    _orb("Camera.").models,
-    single(_orb("Camera."), lambda tree: yaml_text(tree, "%YAML:1.0\n---\n")),
+ORB_SLAM = table(
+    _LEFT,
     _is_orb,
-    _read_orb,
-    files="settings of ORB-SLAM2 and 3, OpenVSLAM, stella_vslam: YAML",
+    "settings of ORB-SLAM2 and 3, OpenVSLAM, stella_vslam: YAML",
+    read=_read_orb,
+    write=_storage,
     most_cameras=1,
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
 )
@@ -122,13 +105,11 @@ _VINS = CameraKeys(
     size=("image_width", "image_height"),
     name="camera_name",
 )
-VINS = Format(
-    "VINS",
-    _VINS.models,
-    single(_VINS, lambda tree: yaml_text(tree, "%YAML:1.0\n---\n")),
-    lambda document: "model_type" in document.tree and "projection_parameters" in document.tree,
-    one(_VINS),
-    files="VINS-Mono, VINS-Fusion, camodocal: YAML",
+VINS = table(
+    _VINS,
+    "model_type projection_parameters",
+    "VINS-Mono, VINS-Fusion, camodocal: YAML",
+    write=_storage,
     most_cameras=1,
 )
 
@@ -146,23 +127,21 @@ _EUROC = CameraKeys(
 )
 
 
-def _read_euroc(document: Document) -> CameraSet:
-    root = document.root
-    if (model := find(root, "camera_model")) is not None and model.text() != "pinhole":
+def _euroc_parts(document: Document) -> dict[str, Field]:
+    if (model := find(document.root, "camera_model")) is not None and model.text() != "pinhole":
         model.fail("pinhole")
-    pose = inverse(transform(root["T_BS"])) if "T_BS" in root else None
-    return mounted([_EUROC.camera(root)], [pose], "EuRoC")
+    return {"camera": document.root}
 
 
-EUROC = Format(
-    "EuRoC",
-    _EUROC.models,
-    single(_EUROC, yaml_text),
+EUROC = table(
+    _EUROC,
     lambda document: (
         document.tree.get("sensor_type") == "camera" or {"T_BS", "intrinsics"} <= set(document.tree)
     ),
-    _read_euroc,
-    files="sensor.yaml of the EuRoC data set",
+    "sensor.yaml of the EuRoC data set",
+    parts=_euroc_parts,
+    pose=PoseKeys(("T_BS",), back=True),
+    write=yaml_text,
     most_cameras=1,
     needs_size=True,
     rig="two files, `T_BS` from each camera to the body (read)",
@@ -180,50 +159,47 @@ _BASALT = CameraKeys(
         Lens(("eucm",), "eucm", under("intrinsics/", "alpha", "beta")),
     ),
     model="camera_type",
+    size=("resolution",),
 )
+_TO_IMU = PoseKeys(("T_imu_cam/qw,qx,qy,qz:quaternion", "T_imu_cam/px,py,pz"), back=True, frame="imu")
 
 
-def _read_basalt(document: Document) -> CameraSet:
+def _basalt_parts(document: Document) -> dict[str, Field]:
     root = document.root.get("value0", document.tree)
-    sizes = [tuple(side.integer() for side in size.items()) for size in root["resolution"].items()]
-    cameras = [_BASALT.camera(one, f"cam{k}") for k, one in enumerate(root["intrinsics"].items())]
-    if len(sizes) != len(cameras) or any(len(size) != 2 for size in sizes):
+    cameras, sizes = (list(root[key].items()) for key in ("intrinsics", "resolution"))
+    if len(sizes) != len(cameras):
         root["resolution"].fail(f"width and height of {len(cameras)} cameras")
-    sized = [
-        replace(camera, image_size=(size[0], size[1])) for camera, size in zip(cameras, sizes, strict=True)
-    ]
-    poses: list[Pose | None] = [None] * len(cameras)
-    for k, entry in enumerate(root["T_imu_cam"].items() if "T_imu_cam" in root else ()):
-        q = [entry[key].number() for key in ("qw", "qx", "qy", "qz")]
-        t = np.array([entry[key].number() for key in ("px", "py", "pz")])
-        if k < len(poses) and any(q):
-            poses[k] = inverse(Pose(from_quaternion(np.array(q)), t))
-    return mounted(sized, poses, "Basalt", frame="imu")
-
-
-def _basalt_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    poses = []
-    for pose in map(inverse, cameras.mounted):
-        q, t = to_quaternion(pose.R).tolist(), pose.t.tolist()
-        poses.append(dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), [*t, *q[1:], q[0]], strict=True)))
-    tree = {
-        "T_imu_cam": poses,
-        "intrinsics": [_BASALT.tree(camera) for camera in cameras.cameras],
-        "resolution": [list(camera.image_size or (0, 0)) for camera in cameras.cameras],
+    poses = list(root["T_imu_cam"].items()) if "T_imu_cam" in root else []
+    lists = {"resolution": sizes, "T_imu_cam": poses}
+    return {
+        f"cam{k}": Field(
+            {
+                **{key: entry.value for key, entry in camera.entries().items()},
+                **{key: own[k].value for key, own in lists.items() if k < len(own)},
+            },
+            root.source,
+            f"cam{k}",
+        )
+        for k, camera in enumerate(cameras)
     }
-    return {"": json_text({"value0": tree})}
 
 
-BASALT = Format(
-    "Basalt",
-    _BASALT.models,
-    _basalt_text,
+def _basalt_tree(trees: list[Tree], cameras: CameraSet) -> Tree:
+    apart = {key: [tree.pop(key) for tree in trees] for key in ("T_imu_cam", "resolution")}
+    return {"value0": {**apart, "intrinsics": trees}}
+
+
+BASALT = table(
+    _BASALT,
     lambda document: (
         {"intrinsics", "resolution"} <= set(document.tree.get("value0", document.tree) or ())
         and "camera_type" in str(document.tree)[:100_000]
     ),
-    _read_basalt,
-    files="calibration.json",
+    "calibration.json",
+    parts=_basalt_parts,
+    pose=_TO_IMU,
+    write=json_text,
+    whole=_basalt_tree,
     most_cameras=99,
     metres=True,
     needs_size=True,
@@ -257,38 +233,32 @@ _SVO = CameraKeys(
 )
 
 
-def _listed(keys: CameraKeys, pose: str) -> Callable[[Document], CameraSet]:
-    def read(document: Document) -> CameraSet:
-        parts = list(document.root["cameras"].items())
-        poses = [inverse(transform(part[pose])) if pose in part else None for part in parts]
-        cameras = [keys.camera(part, f"cam{k}") for k, part in enumerate(parts)]
-        return mounted(cameras, poses, keys.program)
-
-    return read
+def _listed(document: Document) -> dict[str, Field]:
+    return {f"cam{k}": part for k, part in enumerate(document.root["cameras"].items())}
 
 
-def _first_camera(document: Document) -> Mapping[str, Any]:
+def _first_camera(document: Document) -> dict[str, Any]:
     cameras = document.tree.get("cameras")
     first = cameras[0] if isinstance(cameras, list) and cameras else {}
     return first if isinstance(first, dict) else {}
 
 
-OKVIS = Format(
-    "OKVIS",
-    _OKVIS.models,
-    matches=lambda document: "focal_length" in _first_camera(document),
-    read=_listed(_OKVIS, "T_SC"),
-    files="its configuration, YAML",
+OKVIS = table(
+    _OKVIS,
+    lambda document: "focal_length" in _first_camera(document),
+    "its configuration, YAML",
+    parts=_listed,
+    pose=PoseKeys(("T_SC",), back=True),
     most_cameras=99,
     metres=True,
     rig="`T_SC` from each camera to the body",
 )
-SVO = Format(
-    "SVO",
-    _SVO.models,
-    matches=lambda document: "camera" in _first_camera(document),
-    read=_listed(_SVO, "T_B_C"),
-    files="SVO, rpg_vikit, maplab: YAML",
+SVO = table(
+    _SVO,
+    lambda document: "camera" in _first_camera(document),
+    "SVO, rpg_vikit, maplab: YAML",
+    parts=_listed,
+    pose=PoseKeys(("T_B_C",), back=True),
     most_cameras=99,
     metres=True,
     rig="`T_B_C` from each camera to the body",
@@ -311,21 +281,15 @@ _VIKIT = CameraKeys(
 )
 
 
-def _read_vikit(document: Document) -> CameraSet:
+def _vikit_parts(document: Document) -> dict[str, Field]:
     if (scale := document.root.get("scale", 1.0).number()) != 1:
         document.notes.append(
             f"{document.source}: the camera is that of the images before the scale {scale:g}"
         )
-    return CameraSet((_VIKIT.camera(document.root),), program="vikit")
+    return {"camera": document.root}
 
 
-VIKIT = Format(
-    "vikit",
-    _VIKIT.models,
-    matches=lambda document: {"cam_model", "cam_fx"} <= set(document.tree),
-    read=_read_vikit,
-    files="camera of rpg_vikit, FAST-LIVO: YAML",
-)
+VIKIT = table(_VIKIT, "cam_model cam_fx", "camera of rpg_vikit, FAST-LIVO: YAML", parts=_vikit_parts)
 
 # DSO: a line of the model and its numbers, and a line of the size of the images. A principal point below 1 is
 # relative to it, with the first pixel at 1/2. FOV with omega = 0 is a pinhole.
@@ -363,10 +327,9 @@ def _read_dso(document: Document) -> CameraSet:
     return CameraSet((fov(camera, k[0], document) if model == "FOV" else camera,), program="DSO")
 
 
-DSO = Format(
-    "DSO",
-    _DSO.models,
-    matches=lambda document: _DSO_LINES(document.text),
+DSO = table(
+    _DSO,
+    lambda document: _DSO_LINES(document.text),
+    "camera.txt of DSO, LDSO, TUM's monocular data",
     read=_read_dso,
-    files="camera.txt of DSO, LDSO, TUM's monocular data",
 )

@@ -7,25 +7,13 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import (
-    FIVE,
-    K4,
-    RADTAN,
-    CameraKeys,
-    Lens,
-    json_text,
-    transform,
-)
-from neurocal_cli.files.exchange.camera_set import (
-    CameraSet,
-    Format,
-    inverse,
-    mounted,
-)
+from neurocal_cli.files.exchange.camera_keys import FIVE, K4, RADTAN, CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.tree_paths import json_text, under
 from neurocal_cli.files.tree_fields import Field
 
 # nerfstudio and instant-ngp; poses map the camera to the world, with x right, y up, z backwards.
@@ -49,7 +37,8 @@ _NERF = CameraKeys(
 )
 _LEAST = 20.0  # px of a focal length or a principal point
 _OWN = {"fl_x", "fl_y", "cx", "cy", "w", "h", *FIVE, "k4"}
-_FLIP = np.diag([1.0, -1.0, -1.0])
+_FLIP = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+_FRAME = PoseKeys(("transform_matrix",), back=True)
 
 
 def _read_nerf(document: Document) -> CameraSet:
@@ -89,36 +78,31 @@ def _read_nerf(document: Document) -> CameraSet:
     poses = {}
     for k, frame in enumerate(root["frames"].items() if "frames" in root else ()):
         name = frame["file_path"].text() if "file_path" in frame else str(k)
-        if "transform_matrix" in frame:
-            pose = transform(frame["transform_matrix"])
-            poses[name] = inverse(Pose(pose.R @ _FLIP, pose.t))
+        if (pose := _FRAME.read(frame)) is not None:
+            poses[name] = after(_FLIP, pose)
     return CameraSet((_NERF.camera(root),), (), poses, program="nerfstudio")
 
 
-def _nerf_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    tree = _NERF.tree(cameras.cameras[0])
-    frames = []
-    for name, pose in cameras.poses.items():
-        back = inverse(pose)
-        T = np.vstack([np.column_stack([back.R @ _FLIP, back.t]), [0.0, 0.0, 0.0, 1.0]])
-        frames.append({"file_path": name, "transform_matrix": T.tolist()})
-    return {"": json_text({**tree, "frames": frames})}
+def _with_frames(trees: list[Tree], cameras: CameraSet) -> Tree:
+    frames: list[Tree] = [{"file_path": name} for name in cameras.poses]
+    for frame, pose in zip(frames, cameras.poses.values(), strict=True):
+        _FRAME.put(frame, after(_FLIP, pose))
+    return {**trees[0], "frames": frames}
 
 
-NERFSTUDIO = Format(
-    "nerfstudio",
-    _NERF.models,
-    _nerf_text,
+NERFSTUDIO = table(
+    _NERF,
     lambda document: (
         ("fl_x" in document.tree or "camera_angle_x" in document.tree or '"fl_x"' in document.text[:5000])
         and "intrinsics" not in document.tree
     ),
-    _read_nerf,
-    files="transforms.json of nerfstudio and instant-ngp",
+    "transforms.json of nerfstudio and instant-ngp",
+    read=_read_nerf,
+    write=json_text,
+    whole=_with_frames,
     poses=True,
     most_cameras=1,
     needs_size=True,
-    first_pixel=0.5,
 )
 
 # Nerfies, HyperNeRF and the data of DyCheck: fy is the focal length times the aspect, and the pose is that of
@@ -126,14 +110,8 @@ NERFSTUDIO = Format(
 _NERFIES = CameraKeys(
     "Nerfies",
     ("focal_length", "fy", "principal_point/0", "principal_point/1"),
-    (
-        Lens(
-            ("",),
-            "plumb_bob",
-            tuple(f"{name}_distortion/{k}" for name, k in zip(("radial", "radial", "tangential", "tangential",
-                  "radial"), "01012", strict=True)),
-        ),
-    ),
+    (Lens(("",), "plumb_bob", (*under("radial_distortion/", "0", "1"),
+                               *under("tangential_distortion/", "0", "1"), "radial_distortion/2")),),
     size=("image_size",),
     skew="skew",
     first_pixel=0.5,
@@ -141,26 +119,22 @@ _NERFIES = CameraKeys(
 )  # fmt: skip
 
 
-def _read_nerfies(document: Document) -> CameraSet:
+def _nerfies_parts(document: Document) -> dict[str, Field]:
     root = document.root
     fy = root["focal_length"].number() * root["pixel_aspect_ratio"].number()
     key = "tangential" if "tangential" in root else "tangential_distortion"
-    tree = {**root.value, "fy": fy, "tangential_distortion": root[key].value}
     R = root["orientation"].array(3, 3)
-    pose = Pose(R, -R @ root["position"].array(3))
-    return mounted([_NERFIES.camera(Field(tree, root.source))], [pose], "Nerfies", None, "world")
+    own = {"tangential_distortion": root[key].value, "t": (-R @ root["position"].array(3)).tolist()}
+    return {"camera": Field({**root.value, "fy": fy, **own}, root.source)}
 
 
-NERFIES = Format(
-    "Nerfies",
-    _NERFIES.models,
-    matches=lambda document: (
-        {"orientation", "position", "focal_length", "principal_point"} <= set(document.tree)
-    ),
-    read=_read_nerfies,
-    files="camera of Nerfies, HyperNeRF, DyCheck: JSON",
-    skew=True,
-    first_pixel=0.5,
+NERFIES = table(
+    _NERFIES,
+    "orientation position focal_length principal_point",
+    "camera of Nerfies, HyperNeRF, DyCheck: JSON",
+    parts=_nerfies_parts,
+    pose=PoseKeys(("orientation", "t"), frame="world"),
+    unit=None,
 )
 
 # Gyroflow's lens profiles.
@@ -174,23 +148,20 @@ _GYROFLOW = CameraKeys(
 )
 
 
-def _read_gyroflow(document: Document) -> CameraSet:
-    root = document.root
+def _gyroflow_parts(document: Document) -> dict[str, Field]:
     for key in ("input_horizontal_stretch", "input_vertical_stretch"):
-        stretch = root.get(key, 1.0).number()
+        stretch = document.root.get(key, 1.0).number()
         if stretch not in (0.0, 1.0):
             document.notes.append(
                 f"{document.source}: {key} is {stretch:g}; the camera is that of the images which Gyroflow "
                 "stretched"
             )
-    return CameraSet((_GYROFLOW.camera(root),), program="Gyroflow")
+    return {"camera": document.root}
 
 
-def _gyroflow_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    camera = cameras.cameras[0]
-    width, height = camera.image_size or (0, 0)
-    dimension = {"w": width, "h": height}
-    tree = {
+def _profile(trees: list[Tree], cameras: CameraSet) -> Tree:
+    dimension = trees[0]["calib_dimension"]
+    return {
         "note": "",
         "calibrated_by": "neurocal",
         "orig_dimension": dimension,
@@ -198,18 +169,17 @@ def _gyroflow_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         "use_opencv_fisheye": True,
         "focal_length": cameras.lens()[0],
         "crop_factor": cameras.lens()[1],
-        **_GYROFLOW.tree(camera),
+        **trees[0],
     }
-    return {"": json_text(tree)}
 
 
-GYROFLOW = Format(
-    "Gyroflow",
-    ("fisheye",),
-    _gyroflow_text,
-    lambda document: "fisheye_params" in document.tree,
-    _read_gyroflow,
-    files="lens profile, JSON; mm with `--focal-length` or `--crop-factor`",
+GYROFLOW = table(
+    _GYROFLOW,
+    "fisheye_params",
+    "lens profile, JSON; mm with `--focal-length` or `--crop-factor`",
+    parts=_gyroflow_parts,
+    write=json_text,
+    whole=_profile,
     most_cameras=1,
     needs_size=True,
 )
@@ -260,62 +230,28 @@ LENSFUN = Format(
 # Open3D writes matrices by columns.
 
 
-def _column_major(root: Field, key: str, size: int) -> Array:
-    return root[key].array(size * size).reshape(size, size).T
-
-
-def _read_open3d(document: Document) -> CameraSet:
+def _open3d_parts(document: Document) -> dict[str, Field]:
     root = document.root
     inner = root.get("intrinsic", root.value)
-    camera = _OPEN3D.camera(
-        Field({**inner.value, "K": _column_major(inner, "intrinsic_matrix", 3).tolist()}, document.source)
-    )
-    pose = None
-    if "extrinsic" in root:
-        T = _column_major(root, "extrinsic", 4)
-        pose = Pose(T[:3, :3], T[:3, 3])
-    return mounted([camera], [pose], "Open3D", None, "world")
-
-
-def _open3d_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    tree = _OPEN3D.tree(cameras.cameras[0])
-    matrix = np.array(tree.pop("K")).T.ravel().tolist()
-    return {"": json_text({**tree, "intrinsic_matrix": matrix})}
-
-
-_OPEN3D = CameraKeys("Open3D", ("K:matrix",), (Lens(("",), "none", ()),), size=("width", "height"))
-OPEN3D = Format(
-    "Open3D",
-    _OPEN3D.models,
-    _open3d_text,
-    lambda document: (
-        isinstance(
-            (document.tree.get("intrinsic") or document.tree)
-            if not isinstance(document.tree.get("intrinsic"), list)
-            else {},
-            dict,
-        )
-        and _by_columns(document)
-    ),
-    _read_open3d,
-    files="PinholeCameraIntrinsic, PinholeCameraParameters, JSON",
-    most_cameras=1,
-    needs_size=True,
-)
+    return {"camera": Field({**inner.value, "extrinsic": root.get("extrinsic").value}, root.source)}
 
 
 def _by_columns(document: Document) -> bool:
     """Whether there is a flat intrinsic_matrix with the principal point in its last column."""
-    inner = document.tree.get("intrinsic", document.tree)
-    matrix = inner.get("intrinsic_matrix") if isinstance(inner, dict) else None
-    flat = (
-        isinstance(matrix, list) and len(matrix) == 9 and not any(isinstance(m, (list, str)) for m in matrix)
-    )
-    return (
-        flat
-        and matrix is not None
-        and matrix[2] == 0
-        and matrix[5] == 0
-        and matrix[8] == 1
-        and matrix[6] != 0
-    )
+    inner = document.tree.get("intrinsic") or document.tree
+    m = inner.get("intrinsic_matrix") if isinstance(inner, dict) else None
+    flat = isinstance(m, list) and len(m) == 9 and not any(isinstance(entry, (list, str)) for entry in m)
+    return flat and m is not None and m[2] == m[5] == 0 and m[8] == 1 and m[6] != 0
+
+
+OPEN3D = table(
+    CameraKeys("Open3D", ("intrinsic_matrix:columns",), (Lens(("",), "none", ()),), size=("width", "height")),
+    _by_columns,
+    "PinholeCameraIntrinsic, PinholeCameraParameters, JSON",
+    parts=_open3d_parts,
+    pose=PoseKeys(("extrinsic:columns",), frame="world"),
+    unit=None,
+    write=json_text,
+    most_cameras=1,
+    needs_size=True,
+)

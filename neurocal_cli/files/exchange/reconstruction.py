@@ -6,36 +6,19 @@ Their files hold the cameras of a whole project; one camera is read, or the one 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import xml_root
-from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens, under
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.format_table import Tree, only, table
+from neurocal_cli.files.exchange.tree_paths import in_order, under
 from neurocal_cli.files.tree_fields import Field
-
-
-def only(cameras: Iterable[Camera], names: Iterable[str], program: str) -> CameraSet:
-    """The one camera of a project; an InputError names those of several that differ."""
-    found = list(cameras)
-    if not found:
-        raise InputError(f"is a project of {program} without a camera; calibrate it first")
-    alike = {
-        (*one.entries, one.distortion.model, *one.distortion.coefficients, one.image_size) for one in found
-    }
-    if len(alike) > 1:
-        listed = ", ".join(name[:30] for name in names)
-        raise InputError(
-            f"holds several cameras of {program} ({listed}), which have no pose between them; save one as a "
-            "file"
-        )
-    return CameraSet((found[0],), program=program)
-
 
 # Agisoft Metashape: f in pixels, the principal point from the middle of the image, p1 and p2 exchanged. A
 # fisheye has the same polynomial of the angle. Projects hold the same elements for each sensor.
@@ -54,7 +37,7 @@ _METASHAPE = CameraKeys(
 )
 
 
-def _metashape_camera(tree: Mapping[str, Any], source: str) -> Camera:
+def _metashape_part(tree: Mapping[str, Any], source: str) -> Field:
     root = Field({"projection": "frame", **tree}, source)
     width, height = root["width"].integer(1), root["height"].integer(1)
     f = root["f"].number() if "f" in root else root["fy"].number()
@@ -66,14 +49,13 @@ def _metashape_camera(tree: Mapping[str, Any], source: str) -> Camera:
         "cy": root.get("cy", 0.0).number() + middle[1],
         "b2": root.get("b2", 0.0).number() + root.get("skew", 0.0).number(),
     }
-    return _METASHAPE.camera(Field({**root.value, **own}, source))
+    return Field({**root.value, **own}, source)
 
 
-def _read_metashape(document: Document) -> CameraSet:
+def _metashape_parts(document: Document) -> dict[str, Field]:
     if "calibration" in document.tree:
-        tree = document.root["calibration"].value
-        return CameraSet((_metashape_camera(tree, document.source),), program="Metashape")
-    cameras: dict[str, Camera] = {}
+        return {"camera": _metashape_part(document.root["calibration"].value, document.source)}
+    parts = {}
     for sensor in xml_root(document.text, document.source).iter("sensor"):
         adjusted = [
             one for one in sensor.findall("calibration") if one.get("class", "adjusted") == "adjusted"
@@ -88,12 +70,11 @@ def _read_metashape(document: Document) -> CameraSet:
             }
             kind = found.get("type") or sensor.get("type") or "frame"
             name = sensor.get("label") or f"sensor {sensor.get('id')}"
-            cameras[name] = _metashape_camera({**tree, **sides, "projection": kind}, document.source)
-    return only(cameras.values(), cameras, "Metashape")
+            parts[name] = _metashape_part({**tree, **sides, "projection": kind}, document.source)
+    return parts
 
 
-def _metashape_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    tree = _METASHAPE.tree(cameras.cameras[0])
+def _agisoft(tree: Tree) -> str:
     width, height, f = tree["width"], tree["height"], tree["fy"]
     kind = tree.pop("projection")
     entries = {
@@ -109,23 +90,21 @@ def _metashape_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
     lines = [f"  <{key}>{value!r}</{key}>".replace("'", "") for key, value in entries.items()]
     body = "\n".join(lines)
-    return {"": f'<?xml version="1.0" encoding="UTF-8"?>\n<calibration>\n{body}\n</calibration>\n'}
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n<calibration>\n{body}\n</calibration>\n'
 
 
-METASHAPE = Format(
-    "Metashape",
-    _METASHAPE.models,
-    _metashape_text,
+METASHAPE = table(
+    _METASHAPE,
     lambda document: (
         ("<calibration" in document.text[:1000] and "calibration" in document.tree)
         or ("<document" in document.text[:1000] and "<sensor" in document.text)
     ),
-    _read_metashape,
-    files="Agisoft calibration, doc.xml of a project, or exported cameras: XML",
-    skew=True,
+    "Agisoft calibration, doc.xml of a project, or exported cameras: XML",
+    parts=_metashape_parts,
+    project=True,
+    write=_agisoft,
     most_cameras=1,
     needs_size=True,
-    first_pixel=0.5,
 )
 
 # OpenMVG's sfm_data.json. The name of a model stands where it is first used, its number everywhere.
@@ -144,25 +123,25 @@ _OPENMVG = CameraKeys(
 )
 
 
-def _read_openmvg(document: Document) -> CameraSet:
+def _openmvg_parts(document: Document) -> dict[str, Field]:
     names: dict[int, str] = {}
-    cameras: dict[str, Camera] = {}
+    parts = {}
     for entry in document.root["intrinsics"].items():
         value = entry["value"]
         number = value["polymorphic_id"].integer() & 0x7FFFFFFF
         names[number] = value.get("polymorphic_name", names.get(number, "")).text()
         data = value["ptr_wrapper"]["data"]
         tree = {**data.value, **data.get("value0", {}).value, "model": names[number]}
-        cameras[f"intrinsic {entry['key'].text()}"] = _OPENMVG.camera(Field(tree, data.source, data.path))
-    return only(cameras.values(), cameras, "OpenMVG")
+        parts[f"intrinsic {entry['key'].text()}"] = Field(tree, data.source, data.path)
+    return parts
 
 
-OPENMVG = Format(
-    "OpenMVG",
-    _OPENMVG.models,
-    matches=lambda document: {"sfm_data_version", "intrinsics"} <= set(document.tree),
-    read=_read_openmvg,
-    files="sfm_data.json",
+OPENMVG = table(
+    _OPENMVG,
+    "sfm_data_version intrinsics",
+    "sfm_data.json",
+    parts=_openmvg_parts,
+    project=True,
 )
 
 # AliceVision and Meshroom: texts in place of numbers, the focal length in mm since version 1.2.2, and the
@@ -179,12 +158,13 @@ _ALICEVISION = CameraKeys(
         Lens(("fisheye4",), "fisheye", under(_D, "0", "1", "2", "3")),
     ),
     model="model",
+    size=("size",),
 )
 
 
-def _read_alicevision(document: Document) -> CameraSet:
+def _alicevision_parts(document: Document) -> dict[str, Field]:
     version = document.root["version"].array(3).tolist()
-    cameras: dict[str, Camera] = {}
+    parts = {}
     for entry in document.root["intrinsics"].items():
         size = int(entry["width"].number()), int(entry["height"].number())
         c = [entry["principalPoint"].array(2)[k] + (version >= [1, 2, 1]) * 0.5 * size[k] for k in (0, 1)]
@@ -198,21 +178,19 @@ def _read_alicevision(document: Document) -> CameraSet:
             fy = fx * ratio if version >= [1, 2, 5] else fx / ratio
         kind, lens = entry["type"].text(), entry.get("distortionType", "").text()
         tree = {"fx": fx, "fy": fy, "cx": c[0], "cy": c[1], "model": lens if kind == "pinhole" else kind}
-        camera = _ALICEVISION.camera(Field({**entry.value, **tree}, entry.source, entry.path))
-        cameras[f"intrinsic {entry['intrinsicId'].text()}"] = Camera(
-            camera.intrinsics, camera.distortion, size
-        )
-    return only(cameras.values(), cameras, "AliceVision")
+        tree = {**entry.value, **tree, "size": list(size)}
+        parts[f"intrinsic {entry['intrinsicId'].text()}"] = Field(tree, entry.source, entry.path)
+    return parts
 
 
-ALICEVISION = Format(
-    "AliceVision",
-    _ALICEVISION.models,
-    matches=lambda document: (
+ALICEVISION = table(
+    _ALICEVISION,
+    lambda document: (
         "version" in document.tree and "intrinsicId" in str(document.tree.get("intrinsics"))[:2000]
     ),
-    read=_read_alicevision,
-    files="cameras.sfm of Meshroom, JSON",
+    "cameras.sfm of Meshroom, JSON",
+    parts=_alicevision_parts,
+    project=True,
 )
 
 # OpenSfM and OpenDroneMap: coordinates from the middle of the image, divided by its longer side.
@@ -236,7 +214,7 @@ _OPENSFM = CameraKeys(
 _OLD, _CENTRED = {"projection_type": "perspective"}, {"c_x": 0.0, "c_y": 0.0}
 
 
-def _opensfm_parts(document: Document) -> dict[str, Field]:
+def _shots(document: Document) -> dict[str, Field]:
     root = Field(document.tree, document.source)
     return {
         name: Field({**_OLD, **({} if "focal_x" in part else _CENTRED), **part}, root.source, name)
@@ -245,9 +223,9 @@ def _opensfm_parts(document: Document) -> dict[str, Field]:
     }
 
 
-def _read_opensfm(document: Document) -> CameraSet:
-    cameras = {}
-    for name, part in (_opensfm_parts(document) or {"": Field(document.tree, document.source)}).items():
+def _opensfm_parts(document: Document) -> dict[str, Field]:
+    parts = {}
+    for name, part in (_shots(document) or {"": Field(document.tree, document.source)}).items():
         width, height = (part[side].integer(1) for side in ("width", "height"))
         longer = max(width, height)
         tree = {
@@ -256,25 +234,31 @@ def _read_opensfm(document: Document) -> CameraSet:
             for key in ("focal", "focal_x", "focal_y", "c_x", "c_y")
             if key in part
         }
-        cameras[name] = _OPENSFM.camera(Field({**part.value, **tree}, part.source, part.path))
-    return only(cameras.values(), cameras, "OpenSfM")
+        parts[name] = Field({**part.value, **tree}, part.source, part.path)
+    return parts
 
 
-OPENSFM = Format(
-    "OpenSfM",
-    _OPENSFM.models,
-    matches=lambda document: (
-        _opensfm_parts(document)
+OPENSFM = table(
+    _OPENSFM,
+    lambda document: (
+        _shots(document)
         or ({"projection_type", "width", "height"} <= set(document.tree) and "focal" in str(document.tree))
     ),
-    read=_read_opensfm,
-    files="cameras.json, reference of a camera model; also of OpenDroneMap",
+    "cameras.json, reference of a camera model; also of OpenDroneMap",
+    parts=_opensfm_parts,
+    project=True,
 )
 
 # Pix4D's calibrated_camera_parameters.txt: of each image K, the distortion, and the pose, m = K [R|-Rt] X.
-_PIX4D = CameraKeys("Pix4D", ("K:matrix",), (Lens(("",), "plumb_bob", ("D",)),), size=("size",))
+_PIX4D = CameraKeys(
+    "Pix4D",
+    ("K",),
+    (Lens(("",), "plumb_bob", (*under("radial/", "0", "1"), *under("tangential/", "0", "1"), "radial/2")),),
+    size=("size",),
+)
 _PIX4D_HEAD = re.compile(r"\A\s*fileName imageWidth imageHeight\s.*?\[R\|-Rt\] X\s*\n", re.DOTALL).match
 _PIX4D_ROWS = [3, 3, 3, 3, 3, 2, 3, 3, 3, 3]  # words of a name with its size, and numbers
+_PIX4D_ORDER = "size:2 K:9 radial:3 tangential:2 t:3 R:9"
 
 
 def _read_pix4d(document: Document) -> CameraSet:
@@ -287,12 +271,10 @@ def _read_pix4d(document: Document) -> CameraSet:
         name, *words = " ".join(image[0][:-2]), *image[0][-2:], *(word for row in image[1:] for word in row)
         if [len(row) for row in image[1:]] != _PIX4D_ROWS[1:] or len(image[0]) < _PIX4D_ROWS[0]:
             raise InputError(f"the block of the image {name[:40]!r} is damaged; export the file again")
-        values = Field(words, document.source, name[:40]).array(-1)
-        (width, height), K, (k1, k2, k3, p1, p2) = values[:2].tolist(), values[2:11], values[11:16].tolist()
-        tree = {"K": K.tolist(), "D": [k1, k2, p1, p2, k3], "size": [width, height]}
-        cameras.append(_PIX4D.camera(Field(tree, document.source)))
-        R = values[19:28].reshape(3, 3)
-        poses[name] = Pose(R, -R @ values[16:19])
+        part = in_order(_PIX4D_ORDER, words, document.source)
+        cameras.append(_PIX4D.camera(part))
+        R = part["R"].array(9).reshape(3, 3)
+        poses[name] = Pose(R, -R @ part["t"].array(3))
     document.warnings.append(
         f"{document.source}: Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
         "which may be half a pixel off"
@@ -300,12 +282,11 @@ def _read_pix4d(document: Document) -> CameraSet:
     return replace(only(cameras, poses, "Pix4D"), poses=poses)
 
 
-PIX4D = Format(
-    "Pix4D",
-    _PIX4D.models,
-    matches=lambda document: _PIX4D_HEAD(document.text[:2000]),
+PIX4D = table(
+    _PIX4D,
+    lambda document: _PIX4D_HEAD(document.text[:2000]),
+    "calibrated_camera_parameters.txt",
     read=_read_pix4d,
-    files="calibrated_camera_parameters.txt",
     poses=True,
     most_cameras=1,
 )

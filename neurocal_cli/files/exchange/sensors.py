@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-
-import numpy as np
+from collections.abc import Mapping
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_vector, inverse, mounted
+from neurocal_cli.files.exchange.camera_set import STILL, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.reconstruction import only
+from neurocal_cli.files.exchange.format_table import PoseKeys, table
+from neurocal_cli.files.exchange.tree_paths import in_order
 from neurocal_cli.files.image_files import read_header
 from neurocal_cli.files.tree_fields import Field
-
-_STILL = Pose(np.eye(3), np.zeros(3))
 
 # Stereolabs' ZED: sections for each camera and resolution; rows of both images agree after stereoRectify with
 # R of the vector (RX, CV, RZ) and T = -(Baseline, TY, TZ), as in Stereolabs' sample for OpenCV.
@@ -28,11 +25,12 @@ _ZED = CameraKeys(
     "ZED",
     ("fx", "fy", "cx", "cy"),
     (Lens(("",), "plumb_bob", FIVE), Lens(("",), "rational", EIGHT)),
+    size=("size",),
     optional="any",
 )
 
 
-def _read_zed(document: Document) -> CameraSet:
+def _zed_parts(document: Document) -> dict[str, Field]:
     root = document.root
     modes = [key.removeprefix("LEFT_CAM_") for key in document.tree if key.startswith("LEFT_CAM_")]
     fitting = [mode for mode in modes if document.size in (None, _ZED_SIZES.get(mode))]
@@ -40,23 +38,28 @@ def _read_zed(document: Document) -> CameraSet:
         sizes = ", ".join("{} {}".format(*_ZED_SIZES[mode]) for mode in modes if mode in _ZED_SIZES)
         raise InputError(f"holds cameras of several image sizes; convert one with --image-size: {sizes}")
     (mode,) = fitting
-    cameras = [
-        replace(_ZED.camera(root[f"{side}_CAM_{mode}"], side.lower()), image_size=_ZED_SIZES.get(mode))
-        for side in ("LEFT", "RIGHT")
-    ]
     stereo = root["STEREO"]
-    r = [stereo.get(f"{key}_{mode}", 0.0).number() for key in ("RX", "CV", "RZ")]
-    t = [stereo["Baseline"].number(), *(stereo.get(key, 0.0).number() for key in ("TY", "TZ"))]
-    pose = Pose(from_vector(np.array(r)), -np.array(t))
-    return mounted(cameras, [_STILL, pose], "ZED", "mm")
+    pose = {
+        "r": [stereo.get(f"{key}_{mode}", 0.0).number() for key in ("RX", "CV", "RZ")],
+        "T": [-stereo["Baseline"].number(), *(-stereo.get(key, 0.0).number() for key in ("TY", "TZ"))],
+    }
+    return {
+        side.lower(): Field(
+            {**root[f"{side}_CAM_{mode}"].value, **pose, "size": list(_ZED_SIZES.get(mode, (0, 0)))},
+            root.source,
+            f"{side}_CAM_{mode}",
+        )
+        for side in ("LEFT", "RIGHT")
+    }
 
 
-ZED = Format(
-    "ZED",
-    ("none", "plumb_bob", "rational"),
-    matches=lambda document: any(str(key).startswith("LEFT_CAM_") for key in document.tree),
-    read=_read_zed,
-    files="SN*.conf of Stereolabs",
+ZED = table(
+    _ZED,
+    lambda document: any(str(key).startswith("LEFT_CAM_") for key in document.tree),
+    "SN*.conf of Stereolabs",
+    parts=_zed_parts,
+    pose=PoseKeys(("r", "T"), from_first=True),
+    unit="mm",
     rig="R of the vector (RX, CV, RZ), T = -(Baseline, TY, TZ)",
 )
 
@@ -68,6 +71,7 @@ _REALSENSE = CameraKeys(
      Lens(("Kannala Brandt4",), "fisheye", ("D",))),
     model="model",
     size=("size",),
+    name="name",
 )  # fmt: skip
 _STREAM = re.compile(
     r'Intrinsics? of "(?P<name>[^"]+)" / *[^\n]*\n\s*Width:\s*(?P<w>\d+)\s*Height:\s*(?P<h>\d+)'
@@ -84,8 +88,8 @@ def _streams(document: Document) -> list[re.Match[str]]:
     return list(_STREAM.finditer(document.text[:200_000])) or list(_PRINTED.finditer(document.text[:1000]))
 
 
-def _read_realsense(document: Document) -> CameraSet:
-    cameras = {}
+def _realsense_parts(document: Document) -> dict[str, Field]:
+    parts = {}
     for found in _streams(document):
         size = [int(found["w"]), int(found["h"])]
         if document.size not in (None, tuple(size)):
@@ -96,20 +100,19 @@ def _read_realsense(document: Document) -> CameraSet:
                 f"the model {found['model']} of RealSense is not known here; calibrate its images, or use "
                 "streams that the camera undistorts"
             )
-        k = k[:4] if found["model"].startswith("Kannala") and not k[4:].any() else k
         values = {key: found[key] for key in ("fx", "fy", "cx", "cy", "model")}
-        tree = {**values, "D": k.tolist(), "size": size}
         name = found.groupdict().get("name") or "camera"
-        cameras[f"{name} {size[0]}x{size[1]}"] = _REALSENSE.camera(Field(tree, document.source), name)
-    return only(cameras.values(), cameras, "RealSense")
+        tree = {**values, "D": k.tolist(), "size": size, "name": name}
+        parts[f"{name} {size[0]}x{size[1]}"] = Field(tree, document.source)
+    return parts
 
 
-REALSENSE = Format(
-    "RealSense",
-    _REALSENSE.models,
-    matches=_streams,
-    read=_read_realsense,
-    files="list of rs-enumerate-devices -c, and Python's text of intrinsics",
+REALSENSE = table(
+    _REALSENSE,
+    _streams,
+    "list of rs-enumerate-devices -c, and Python's text of intrinsics",
+    parts=_realsense_parts,
+    project=True,
 )
 
 # DepthAI's boards: a socket and its camera in turn, lengths in cm. The extrinsics map a camera's frame to
@@ -123,43 +126,42 @@ _OAK = CameraKeys(
 )
 
 
-def _read_oak(document: Document) -> CameraSet:
+_TO_SOCKET = PoseKeys(("extrinsics/rotationMatrix", "extrinsics/translation/x,y,z"))
+
+
+def _oak_parts(document: Document) -> dict[str, Field]:
     parts = {}
     for entry in document.root["cameraData"].items():
         if not isinstance(entry.value, list) or len(entry.value) != 2:
             entry.fail("a socket and its camera")
         socket, camera = entry.items()
-        if np.any(camera["intrinsicMatrix"].array(3, 3)):
-            parts[socket.integer()] = camera
-    poses: dict[int, Pose] = {}
-    links = {number: part["extrinsics"] for number, part in parts.items()}
-    roots = [number for number, link in links.items() if link["toCameraSocket"].integer(-1) in (-1, number)]
-    poses.update(dict.fromkeys(roots[:1], _STILL))
+        if not camera["intrinsicMatrix"].array(3, 3).any():
+            continue
+        kind = {"cameraType": str(int(camera["cameraType"].integer() == 1))}
+        parts[socket.integer()] = Field({**camera.value, **kind}, camera.source, camera.path)
+    return {f"CAM_{chr(ord('A') + number)}": part for number, part in sorted(parts.items())}
+
+
+def _oak_poses(parts: Mapping[str, Field]) -> list[Pose | None]:
+    """Poses from the root of the tree, along the links from socket to socket."""
+    sockets = {name: ord(name[-1]) - ord("A") for name in parts}
+    to = {name: part["extrinsics"]["toCameraSocket"].integer(-1) for name, part in parts.items()}
+    roots = [name for name in parts if to[name] in (-1, sockets[name])]
+    poses = {sockets[name]: STILL for name in roots[:1]}
     for _ in parts:
-        for number, link in links.items():
-            to = link["toCameraSocket"].integer(-1)
-            if number not in roots and to in poses:
-                t = np.array([link["translation"][axis].number() for axis in "xyz"])
-                poses[number] = after(inverse(Pose(link["rotationMatrix"].array(3, 3), t)), poses[to])
-    cameras = []
-    for number, part in sorted(parts.items()):
-        k = part["distortionCoeff"].array(-1)
-        wide = part["cameraType"].integer() == 1
-        tree = {
-            **part.value,
-            "cameraType": str(int(wide)),
-            "distortionCoeff": (k[:4] if wide else k).tolist(),
-        }
-        cameras.append(_OAK.camera(Field(tree, part.source, part.path), f"CAM_{chr(ord('A') + number)}"))
-    return mounted(cameras, [poses.get(number) for number in sorted(parts)], "OAK", "cm")
+        for name, part in parts.items():
+            if name not in roots and to[name] in poses and (link := _TO_SOCKET.read(part)) is not None:
+                poses[sockets[name]] = after(inverse(link), poses[to[name]])
+    return [poses.get(sockets[name]) for name in parts]
 
 
-OAK = Format(
-    "OAK",
-    _OAK.models,
-    matches=lambda document: {"cameraData", "boardName"} <= set(document.tree),
-    read=_read_oak,
-    files="calibration of DepthAI's boards, JSON",
+OAK = table(
+    _OAK,
+    "cameraData boardName",
+    "calibration of DepthAI's boards, JSON",
+    parts=_oak_parts,
+    pose=_oak_poses,
+    unit="cm",
     most_cameras=99,
     rig="`extrinsics` to the socket `toCameraSocket`, in cm",
 )
@@ -174,12 +176,16 @@ _KINECT_MODES = {
     (512, 512): ((512, 512), (0, 0)), (1024, 1024): ((1024, 1024), (0, 0)),
 }  # fmt: skip
 _KINECT = CameraKeys(
-    "Azure Kinect", ("fx", "fy", "cx", "cy"), (Lens(("",), "rational", EIGHT),), first_pixel=0.5
+    "Azure Kinect",
+    ("fx", "fy", "cx", "cy"),
+    (Lens(("",), "rational", EIGHT),),
+    size=("size",),
+    first_pixel=0.5,
 )
-_KINECT_ORDER = ("cx", "cy", "fx", "fy", "k1", "k2", "k3", "k4", "k5", "k6", "codx", "cody", "p2", "p1")
+_KINECT_ORDER = "cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1"
 
 
-def _read_kinect(document: Document) -> CameraSet:
+def _kinect_parts(document: Document) -> dict[str, Field]:
     if document.size not in _KINECT_MODES:
         sizes = ", ".join(f"{width} {height}" for width, height in _KINECT_MODES)
         raise InputError(
@@ -193,25 +199,22 @@ def _read_kinect(document: Document) -> CameraSet:
             continue
         if not (model := part["Intrinsics"]["ModelType"]).text().endswith("BrownConrady"):
             model.fail("CALIBRATION_LensDistortionModelBrownConrady")
-        values = part["Intrinsics"]["ModelParameters"].array(-1)[: len(_KINECT_ORDER)].tolist()
-        tree = dict(zip(_KINECT_ORDER, values, strict=True))
+        tree = in_order(_KINECT_ORDER, part["Intrinsics"]["ModelParameters"].value, document.source).value
         if tree.pop("codx") or tree.pop("cody"):
             raise InputError("codx and cody, a centre of the distortion, are not known here")
         if 16 * part["SensorHeight"].integer() == 9 * part["SensorWidth"].integer():  # of older firmware
             tree["cy"], tree["fy"] = 0.75 * tree["cy"] + 0.125, 0.75 * tree["fy"]
         tree |= {"fx": width * tree["fx"], "fy": height * tree["fy"]}
         tree |= {"cx": width * tree["cx"] - corner[0], "cy": height * tree["cy"] - corner[1]}
-        camera = _KINECT.camera(Field(tree, document.source), purpose.lower())
-        return CameraSet((replace(camera, image_size=document.size),), program="Azure Kinect")
+        return {purpose.lower(): Field({**tree, "size": list(document.size)}, document.source)}
     raise InputError(f"holds no camera of the purpose {purpose}; give another --image-size")
 
 
-KINECT = Format(
-    "Azure Kinect",
-    _KINECT.models,
-    matches=lambda document: "CalibrationInformation" in document.tree,
-    read=_read_kinect,
-    files="raw calibration, JSON, with `--image-size`",
+KINECT = table(
+    _KINECT,
+    "CalibrationInformation",
+    "raw calibration, JSON, with `--image-size`",
+    parts=_kinect_parts,
 )
 
 # DJI's DewarpData, in the XMP of a photograph or as exiftool prints it: a date; fx, fy, the principal point
@@ -225,7 +228,7 @@ def _dewarp(document: Document) -> re.Match[bytes] | None:
     return _DEWARP.search(document.data[:_XMP_BYTES])
 
 
-def _read_dji(document: Document) -> CameraSet:
+def _dji_parts(document: Document) -> dict[str, Field]:
     found = _dewarp(document)
     assert found is not None  # `matches`
     size = document.size
@@ -234,16 +237,16 @@ def _read_dji(document: Document) -> CameraSet:
         size = header.width, header.height
     if size is None:
         raise InputError("holds the camera of a DJI, from the middle of its images; give --image-size W H")
-    values = dict(zip(("fx", "fy", "cx", "cy", *FIVE), map(float, found[1].split(b",")), strict=True))
+    words = found[1].decode().replace(",", " ").split()
+    values = in_order("fx fy cx cy k1 k2 p1 p2 k3", words, document.source).value
     values["cx"] += 0.5 * (size[0] - 1)
     values["cy"] += 0.5 * (size[1] - 1)
-    return CameraSet((_DJI.camera(Field({**values, "size": list(size)}, document.source)),), program="DJI")
+    return {"camera": Field({**values, "size": list(size)}, document.source)}
 
 
-DJI = Format(
-    "DJI",
-    _DJI.models,
-    matches=_dewarp,
-    read=_read_dji,
-    files="photographs with DewarpData, or its text with `--image-size`",
+DJI = table(
+    _DJI,
+    _dewarp,
+    "photographs with DewarpData, or its text with `--image-size`",
+    parts=_dji_parts,
 )
