@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -112,11 +113,19 @@ def outline_pixels(
 
 
 def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Pixels (N, M, 2) of a window for each outline (N, K, 2), and a mask of those near its box."""
+    """Pixels (N, M, 2) along each outline (N, K, 2), padded to the same number, and a mask of what is no padding."""
     low, high = np.floor(outline.min(axis=1) - reach), np.ceil(outline.max(axis=1) + reach) + 1
-    width, height = (high - low).max(axis=0).astype(int)
+    width, height = (high - low).max(axis=0).astype(int).tolist()
     away = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-    return low[:, None] + away, (away < (high - low)[:, None]).all(axis=2)
+    along = np.zeros((len(outline), height, width), dtype=np.uint8)
+    # Between its corners, the polygon is this far within the outline.
+    sagitta = (1 - np.cos(np.pi / outline.shape[1])) * max(width, height)
+    thickness = 2 * int(np.ceil(_ROUGHLY * reach + sagitta)) + 3
+    for mask, line in zip(along, np.rint(outline - low[:, None]).astype(np.int32), strict=True):
+        cv2.polylines(mask, [line], True, 1, thickness)
+    near = (away < (high - low)[:, None]).all(axis=2) & (along.reshape(len(low), -1) > 0)
+    index, used = packed(near, near.sum(axis=1))
+    return low[:, None] + away[index % len(away)], used
 
 
 def _distances(
