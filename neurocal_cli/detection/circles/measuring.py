@@ -113,7 +113,7 @@ def outline_pixels(
 
 
 def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Pixels (N, M, 2) along each outline (N, K, 2), padded to the same number, and a mask of what is no padding."""
+    """Pixels (N, M, 2) along each outline (N, K, 2), padded to the same number, and a mask (N, M) of them."""
     low, high = np.floor(outline.min(axis=1) - reach), np.ceil(outline.max(axis=1) + reach) + 1
     width, height = (high - low).max(axis=0).astype(int).tolist()
     away = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
@@ -144,8 +144,7 @@ def _distances(
 
     def nearer(foot: Array, point: Array) -> tuple[Array, Array, Array]:
         """Distance from the outline, normal at a foot near it, and the radius there."""
-        a, b = inverse.at(foot)
-        au, av, bu, bv = inverse.slopes(foot)
+        a, b, au, av, bu, bv = inverse.at(foot)
         rho = np.maximum(np.hypot(a, b), 1e-9)
         slope = np.stack([a * au + b * bu, a * av + b * bv], axis=-1) / rho[..., None]
         steep = np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)
@@ -163,7 +162,7 @@ def _distances(
         foot = point - d[..., None] * n
         d, n, _ = nearer(foot, point)
     # Curvature of an ellipse with the shape of the map at the centre: M maps pixels to the board.
-    M = np.stack(inverse.slopes(seen[:, :1]), axis=-1).reshape(-1, 2, 2)
+    M = np.stack(inverse.at(seen[:, :1])[2:], axis=-1).reshape(-1, 2, 2)
     G = M.swapaxes(1, 2) @ M / radius**2
     gradient = (foot - seen[:, :1]) @ G
     length = np.maximum(np.hypot(gradient[..., 0], gradient[..., 1]), 1e-12)

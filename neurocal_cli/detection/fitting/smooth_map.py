@@ -316,6 +316,16 @@ def polynomials(degree: int, frame: Frame, x: Array, y: Array) -> Array:
 
 _DEGREE = 4
 _POWERS = tuple((i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i))
+# (2, M, M) coefficients of the derivatives along x and y of each product of powers.
+_DERIVATIVES = np.array(
+    [
+        [
+            [(one[axis] if other == (one[0] - 1 + axis, one[1] - axis) else 0.0) for other in _POWERS]
+            for one in _POWERS
+        ]
+        for axis in (0, 1)
+    ]
+)
 
 
 @frozen_dataclass(eq=False)
@@ -324,7 +334,7 @@ class LocalInverse:
 
     centre: Array  # (C, 2) [px]
     scale: Array  # (C,) [px]
-    coefficients: Array  # (C, 2, M) of a and of b
+    coefficients: Array  # (C, 6, M) of a, b, and their derivatives au, av, bu and bv [1/px]
 
     @classmethod
     def of(cls, pixels: Array, places: Array) -> LocalInverse:
@@ -333,41 +343,27 @@ class LocalInverse:
         away = pixels - centre[:, None]
         scale = np.abs(away).max(axis=(1, 2))
         terms = _terms(away / scale[:, None, None])
-        return cls(centre, scale, np.asarray((np.linalg.pinv(terms.swapaxes(1, 2)) @ places).swapaxes(1, 2)))
+        values = (np.linalg.pinv(terms.swapaxes(1, 2)) @ places).swapaxes(1, 2)
+        slopes = np.einsum("cam,xmn->caxn", values, _DERIVATIVES) / scale[:, None, None, None]
+        return cls(centre, scale, np.concatenate([values, slopes.reshape(len(scale), 4, -1)], axis=1))
 
-    def at(self, pixels: Array) -> tuple[Array, Array]:
-        """Places a and b (C, N) of pixels (C, N, 2)."""
-        places = self.coefficients @ _terms(self._scaled(pixels))
-        return places[:, 0], places[:, 1]
-
-    def slopes(self, pixels: Array) -> tuple[Array, Array, Array, Array]:
-        """Derivatives au, av, bu, bv (C, N) at pixels (C, N, 2) [1/px]."""
-        scaled = self._scaled(pixels)
-        x, y = (_up_to(scaled[..., k]) for k in (0, 1))
-        du, dv = np.zeros((2, len(pixels), len(_POWERS), pixels.shape[1]))
-        for k, (i, j) in enumerate(_POWERS):
-            if i:
-                np.multiply(i * x[i - 1], y[j], out=du[:, k])
-            if j:
-                np.multiply(j * x[i], y[j - 1], out=dv[:, k])
-        by_u, by_v = (self.coefficients @ one / self.scale[:, None, None] for one in (du, dv))
-        return by_u[:, 0], by_v[:, 0], by_u[:, 1], by_v[:, 1]
-
-    def _scaled(self, pixels: Array) -> Array:
-        return np.asarray((pixels - self.centre[:, None]) / self.scale[:, None, None])
-
-
-def _up_to(x: Array) -> list[Array]:
-    powers = [np.ones_like(x), x]
-    for _ in range(_DEGREE - 1):
-        powers.append(powers[-1] * x)
-    return powers
+    def at(self, pixels: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Places a and b (C, N) of pixels (C, N, 2), and derivatives au, av, bu and bv [1/px]."""
+        scaled = (pixels - self.centre[:, None]) / self.scale[:, None, None]
+        a, b, au, av, bu, bv = (self.coefficients @ _terms(scaled)).swapaxes(0, 1)
+        return a, b, au, av, bu, bv
 
 
 def _terms(place: Array) -> Array:
     """(C, M, N) products of powers of places (C, N, 2)."""
-    x, y = (_up_to(place[..., k]) for k in (0, 1))
     terms = np.empty((len(place), len(_POWERS), place.shape[1]))
+    x, y = (np.ascontiguousarray(place[..., k]) for k in (0, 1))
     for k, (i, j) in enumerate(_POWERS):
-        np.multiply(x[i], y[j], out=terms[:, k])
+        # Each product follows from an earlier one.
+        if j:
+            np.multiply(terms[:, k - 1], y, out=terms[:, k])
+        elif i:
+            np.multiply(terms[:, _POWERS.index((i - 1, 0))], x, out=terms[:, k])
+        else:
+            terms[:, k] = 1.0
     return terms

@@ -88,14 +88,14 @@ class FoundPlane:
 
 def seen_markers(image: NDArray[np.generic]) -> tuple[SeenMarkers, ...]:
     """Lattices of markers in a grey image, for each dictionary that may be meant; those of most first."""
-    for inverted in (False, True):
-        picture = negative(image) if inverted else image
+    for inverted, codes in enumerate(read_codes(eight_bits(image))):
         found = []
-        for marks, border in read_codes(eight_bits(picture)):
+        for marks, border in codes:
             lie = lie_of(marks)
             # On ChArUco boards, OpenCV prints borders of one cell.
             if lie is not None and len(lie.marks) >= _FEWEST and (lie.tags or border == 1):
-                found.append(SeenMarkers(picture, lie, border, inverted))
+                picture = negative(image) if inverted else image
+                found.append(SeenMarkers(picture, lie, border, bool(inverted)))
         if found:
             return tuple(sorted(found, key=lambda one: -len(one.lie.marks)))
     return ()

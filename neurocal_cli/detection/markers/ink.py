@@ -16,6 +16,7 @@ the fit found for all edges, and the response F applies to the sum of pattern an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -140,8 +141,8 @@ def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: fl
     pixels, used = _near_edges(result, ink, corners, blur[:, :2].max(axis=1), len(ink.lines) == 2)
     if not used.any():
         return result
-    a, b = inverse.at(pixels)
-    blurred = _Blurred.of(inverse.slopes(pixels), blur, look.shift, look.tails)
+    a, b, *slopes = inverse.at(pixels)
+    blurred = _Blurred.of(slopes, blur, look.shift, look.tails)
     change = blurred.pattern(a, b, ink.lines, ink.inner)
     u, v = pixels[used].T.astype(np.intp)
     # Linear within a cell: a local shading takes long at so many places.
@@ -226,9 +227,7 @@ class _Blurred:
     tails: Array  # (1, 2)
 
     @classmethod
-    def of(
-        cls, slopes: tuple[Array, Array, Array, Array], blur: Array, shift: float, tails: Array
-    ) -> _Blurred:
+    def of(cls, slopes: Sequence[Array], blur: Array, shift: float, tails: Array) -> _Blurred:
         """From the derivatives of a and b by the pixel, and the blur of cells as in `Appearance`."""
         au, av, bu, bv = slopes
         across_a, across_b = np.hypot(au, av), np.hypot(bu, bv)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import Image, grey_levels
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.lattice import Placed, corners_of_tags, find_vertices, place
-from neurocal_cli.detection.markers.reading import USUAL, read_markers
+from neurocal_cli.detection.markers.reading import USUAL, Marks, codes_in, read_markers
 from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
@@ -38,11 +41,11 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
     """
     grey, light = eight_bits(image), grey_levels(image)
     located, notes = [], []
-    read = 0
+    read, quadrangles = 0, list[Array]()
     for index, plane in enumerate(board.planes):
         if plane.markers is None:
             raise InputError("a board has markers on all its planes, or on none; describe them in two files")
-        placed = _placed(plane, grey)
+        placed = _placed(plane, grey, quadrangles)
         found = None if placed is None else _vertices(plane, placed, light)
         if placed is None or found is None:
             read = max(read, 0 if placed is None else len(placed.at))
@@ -60,7 +63,7 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
         located.append(_located(plane, index, placed, *found))
         notes.append(_told(plane, placed, found[0]))
     if not located:
-        raise NoBoardError(_reason(board, grey, read))
+        raise NoBoardError(_reason(board, grey, read, quadrangles))
     return Identified(tuple(located), notes=tuple(dict.fromkeys(note for note in notes if note)))
 
 
@@ -73,8 +76,11 @@ def _vertices(plane: Plane, placed: Placed, light: Image) -> tuple[Grid, tuple[i
     return corners_of_tags(plane, placed) if isinstance(plane, TagPlane) and few else found
 
 
-def _placed(plane: Plane, grey: NDArray[np.uint8]) -> Placed | None:
-    """The markers of a plane, of the dictionary of which most agree with each other."""
+def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: list[Array]) -> Placed | None:
+    """The markers of a plane, of the dictionary of which most agree with each other.
+
+    The `quadrangles` that may be markers of any dictionary are added to the list.
+    """
     markers = plane.markers
     assert markers is not None
     count = len(marked_cells(plane, next(prints(plane))).number)
@@ -87,8 +93,11 @@ def _placed(plane: Plane, grey: NDArray[np.uint8]) -> Placed | None:
             "dictionary or the number of squares"
         )
     best: Placed | None = None
-    for dictionary in (named,) if named else USUAL:
-        for marks in read_markers(grey, dictionary, first, count, border):
+    dictionaries = [named or USUAL[0]]
+    for dictionary in dictionaries:
+        for marks, every in read_markers(grey, dictionary, first, count, border):
+            if len(dictionaries) == 1:
+                quadrangles.append(every)
             placed = place(plane, marks)
             if placed is not None and (best is None or len(placed.at) > len(best.at) or best.unsure):
                 best = placed
@@ -96,7 +105,15 @@ def _placed(plane: Plane, grey: NDArray[np.uint8]) -> Placed | None:
                 break
         if best is not None and len(best.at) >= _ENOUGH:
             break
+        if not named and len(dictionaries) == 1:
+            seen = {marks.dictionary for marks, cells in _codes(grey, quadrangles) if cells == border}
+            dictionaries += [one for one in USUAL[1:] if one in seen]
     return best
+
+
+def _codes(grey: NDArray[np.uint8], quadrangles: Sequence[Array]) -> Iterator[tuple[Marks, int]]:
+    """Markers of any dictionary and the widths of their borders, at each scale."""
+    return chain.from_iterable(codes_in(grey, every) for every in quadrangles)
 
 
 def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[int, int]) -> Located:
@@ -146,31 +163,32 @@ def smallest(dictionary: str, cells: Cells) -> str:
     )
 
 
-def _reason(board: Board, grey: NDArray[np.uint8], read: int) -> str:
+def _reason(board: Board, grey: NDArray[np.uint8], read: int, quadrangles: Sequence[Array]) -> str:
     """Why no plane was located, although so many markers of one were read."""
     if read >= _ENOUGH:
         return (
             f"{read} markers of the board are read, but the squares of a chessboard around them are not "
             "seen; show it sharper or nearer, or use a board that has them"
         )
-    tags = next((plane for plane in board.planes if isinstance(plane, TagPlane)), None)
-    if tags is not None and tags.markers is not None:
-        family, first, other = tags.markers.dictionary, tags.markers.first_id, 3 - tags.border
-        marks = next(read_markers(grey, family, first, tags.tags[0] * tags.tags[1], other), None)
-        if marks is not None and len(np.unique(marks.number)) >= _ENOUGH:
-            cells = "a border of one cell" if other == 1 else "a border of two cells"
-            return f"the tags have {cells}; say border: {other} in a board file"
     named = {plane.markers.dictionary for plane in board.planes if plane.markers is not None} - {""}
-    for dictionary in USUAL if named else ():
-        if any(dictionary.rpartition("_")[0] == one.rpartition("_")[0] for one in named):
-            continue
-        marks = next(read_markers(grey, dictionary, 0, min(code_count(dictionary), 50)), None)
-        if marks is not None and len(np.unique(marks.number)) >= _STRANGE:
+    tags = next((plane for plane in board.planes if isinstance(plane, TagPlane)), None)
+    for marks, border in _codes(grey, quadrangles) if named else ():
+        if any(_codes_alike(marks.dictionary, one) for one in named):
+            if tags is not None and border != tags.border and len(marks) >= _ENOUGH:
+                cells = "a border of one cell" if border == 1 else "a border of two cells"
+                return f"the tags have {cells}; say border: {border} in a board file"
+        elif len(marks) >= _STRANGE:
             return (
-                f"the image shows markers of {dictionary} instead of {' and '.join(sorted(named))}; correct "
-                "the dictionary of the board"
+                f"the image shows markers of {marks.dictionary} instead of {' and '.join(sorted(named))}; "
+                "correct the dictionary of the board"
             )
     return (
         "no two markers of the board can be read together; show more of it, sharp and evenly lit, or correct "
         "its description"
     )
+
+
+def _codes_alike(one: str, other: str) -> bool:
+    """Whether a dictionary begins with the codes of another."""
+    bits, _, count = one.rpartition("_")
+    return one == other or (count.isdigit() and other.rpartition("_")[0] == bits)

@@ -62,20 +62,20 @@ class Marks:
 
 def read_markers(
     grey: NDArray[np.uint8], dictionary: str, first: int, count: int, border: int = 1
-) -> Iterator[Marks]:
+) -> Iterator[tuple[Marks, Array]]:
     """Read the markers ``first`` to ``first + count - 1`` of a dictionary, at one or more scales of an image.
 
-    The caller stops when enough of them are read. `border` is the width of a marker's border in cells.
+    The caller stops when enough of them are read. The quadrangles (N, 4, 2) [px] that may be markers of any
+    dictionary come with them. `border` is the width of a marker's border in cells.
     """
     detector = _detector(dictionary, first, count, border)
     if detector is None:
         return
     for scale in scales_of(grey):
-        corners, ids, _ = _detected(detector, grey, scale)
-        if ids is None or not len(ids):
-            continue
-        number = np.asarray(ids).reshape(-1).astype(np.int64) + first
-        yield Marks(number, _places(corners, scale), dictionary)
+        corners, ids, rejected = _detected(detector, grey, scale)
+        number = np.zeros(0) if ids is None else np.asarray(ids).reshape(-1)
+        marks = Marks(number.astype(np.int64) + first, _places(corners, scale), dictionary)
+        yield marks, _places([*corners, *rejected], scale)
 
 
 def candidates(grey: NDArray[np.uint8], scale: float) -> Array:
@@ -192,19 +192,31 @@ _LIGHT_RIM = 0.5  # greatest share of light samples of a rim
 _ENOUGH = 12  # markers at a scale after which no other is tried
 
 
-def read_codes(grey: NDArray[np.uint8]) -> list[tuple[Marks, int]]:
+def read_codes(grey: NDArray[np.uint8]) -> tuple[list[tuple[Marks, int]], list[tuple[Marks, int]]]:
     """Markers of each dictionary that has at least two in an image, and the width of their border [cells].
 
-    A marker of one dictionary may look like one of another, so several dictionaries may be named.
+    A marker of one dictionary may look like one of another, so several dictionaries may be named. The second
+    result is what the negative of the image shows.
     """
-    best: list[tuple[Marks, int]] = []
+    best: tuple[list[tuple[Marks, int]], ...] = ([], [])
     for scale in scales_of(grey):
-        found = list(codes_in(grey, candidates(grey, scale)))
-        if max((len(marks) for marks, _ in found), default=0) > max((len(one) for one, _ in best), default=0):
-            best = found
-        if best and max(len(marks) for marks, _ in best) >= _ENOUGH:
+        every = candidates(grey, scale)
+        found = list(codes_in(grey, every)), list(_codes_of_negative(grey, every, scale))
+        best = tuple(max(pair, key=_most) for pair in zip(best, found, strict=True))
+        if _most(best[0]) >= _ENOUGH:
             break
-    return best
+    return best[0], best[1]
+
+
+def _codes_of_negative(grey: NDArray[np.uint8], every: Array, scale: float) -> Iterator[tuple[Marks, int]]:
+    """Markers in the negative of an image, whose quadrangles differ by a pixel from those of the image."""
+    negative = np.asarray(255 - grey)
+    return codes_in(negative, candidates(negative, scale)) if any(codes_in(negative, every)) else iter(())
+
+
+def _most(found: Sequence[tuple[Marks, int]]) -> int:
+    """The number of markers of the dictionary with the most."""
+    return max((len(marks) for marks, _ in found), default=0)
 
 
 def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
