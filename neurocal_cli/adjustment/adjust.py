@@ -47,11 +47,28 @@ class Adjusted:
     each_settled: NDArray[np.bool_]
     # Sum of squared (whitened) residuals of all views at the start, with the penalty's.
     before: float = np.nan
+    second: SecondPoses | None = None  # if they have been looked for
 
     @property
     def converged(self) -> bool:
         """Whether all problems converged."""
         return bool(self.each_settled.all())
+
+    def of_views(self, which: NDArray[np.bool_]) -> Adjusted:
+        """Some of the views, if each is a problem of its own."""
+        state = replace(self.state, R=self.state.R[which], t=self.state.t[which])
+        return Adjusted(
+            state, self.normal[which], self.cost[which], self.iterations, self.each_settled[which]
+        )
+
+
+@frozen_dataclass(eq=False)
+class SecondPoses:
+    """Flat targets tilted the other way that fit nearly as well, with the camera as it is."""
+
+    at: CameraState  # the camera and the first poses
+    views: NDArray[np.intp]  # (n,)
+    posed: Adjusted  # of these views
 
 
 def adjust(

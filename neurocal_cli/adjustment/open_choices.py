@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.prior import LEAN, STRETCH
 from neurocal_cli.adjustment.cross_validation import inverse_or_nan, quietly, reduced, solve_or_nan
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.adjustment.reprojection import displaced_blocks, free_columns, pose_response
-from neurocal_cli.adjustment.views import PointBatches, Views
+from neurocal_cli.adjustment.reprojection import free_columns, pose_response, stretched_blocks
+from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -329,8 +329,3 @@ def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | Non
     right = (g[-2:] + T.T @ g[:-2]) / variance
     beyond = float(right @ solve_or_nan(left + STRETCH**2 * left @ left, right))
     return found if found.probability > _NEGLIGIBLE and not beyond > _NO_PRINT**2 else None
-
-
-def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Array:
-    """(V, 14 + K, 14 + K) normal matrices with columns of both `stretches` before that of the residual."""
-    return displaced_blocks(batches, state, 2, lambda chunk: by @ batches.local[chunk][:, None])

@@ -7,8 +7,6 @@ and the residual, in this order.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,27 +59,35 @@ def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDA
     return batches.sum_by_view(by_batch), np.logical_and.reduceat(sensible, batches.first)
 
 
-def displaced_blocks(
-    batches: PointBatches, state: CameraState, m: int, displaced: Callable[[slice], Array]
-) -> Array:
+def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Array:
     """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
 
-    These columns are the derivatives by m ways in which the target may be displaced. `displaced` returns the
-    displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
+    These columns are the derivatives by m unit deformations (m, 3, 3) of the target.
     """
-    width, n = 12 + len(state.k), batches.local.shape[2]
+    width, n, m = 12 + len(state.k), batches.local.shape[2], len(by)
     by_batch = np.empty((len(batches.view), width + m, width + m))
-    buffer = batches.memory(width, state.square)
+    buffer = batches.memory(width + m, state.square)
     for chunk in batches.chunks():
         view = batches.view[chunk]
-        part = buffer[: len(view), :-1]
-        derivatives(batches, chunk, state, part)
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part[:, :width])
+        part[:, -2] = part[:, width - 1]
         by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
         by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
-        more = np.einsum("tipn,tsin->tspn", by_local, displaced(chunk))
-        J = np.concatenate([part[:, :-1], more, part[:, -1:]], axis=1).reshape(len(view), width + m, -1)
-        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+        displaced = np.swapaxes(by @ batches.local[chunk][:, None], 1, 2)
+        put_displaced(by_local, displaced, part[:, width - 1 : -2])
+        products(part, by_batch[chunk])
     return batches.sum_by_view(by_batch)
+
+
+def put_displaced(by_point: Array, displaced: Array, out: Array) -> None:
+    """Fill out (T, m, 2, n) with the derivatives by m displacements (T or 1, 3, m, n) of the points.
+
+    `by_point` (T, 3, 2, n) are those by the points.
+    """
+    first, *others = (by_point[:, i, None] * displaced[:, i, :, None] for i in range(3))
+    np.add(first, others[0], out=out)
+    out += others[1]
 
 
 def residuals(batches: PointBatches, state: CameraState) -> Array:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from neurocal_cli.adjustment.covariance import Covariance, covariance
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.reprojection import normal_blocks
-from neurocal_cli.adjustment.residual_correlation import point_residuals
+from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import StraightLines
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -147,6 +147,17 @@ class Solution:
         """Covariances from the normal matrices alone, for a target that is as given."""
         problem, n = self.problem, self.problem.views.n_equations + self.by_prior
         return covariance(self.adjusted.normal, problem.free_camera, problem.free_poses, n, self.shared)
+
+    @cached_property
+    def alike(self) -> float:
+        """Correlation of the residuals of neighbouring points."""
+        return correlation(self.problem.views, self.residuals)
+
+    def noted(self, **facts: Any) -> Solution:
+        """The same minimum with other facts about it, none of which changes what is computed of it."""
+        noted = replace(self, **facts)
+        vars(noted).update({name: value for name, value in vars(self).items() if name not in vars(noted)})
+        return noted
 
     @property
     def camera(self) -> Camera:

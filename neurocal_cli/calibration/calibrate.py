@@ -216,7 +216,7 @@ def calibrate(
             if angle == "auto" and problem.free_camera.any() and shows_skew(solution):
                 solution, rejected = _solved(stated(True), options, outliers, choice)
             if known_target is not None:
-                solution = replace(solution, target=known_target)
+                solution = solution.noted(target=known_target)
             if solution.refusal:
                 raise DegenerateGeometryError(solution.refusal)
             found = calibration_of(

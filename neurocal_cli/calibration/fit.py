@@ -206,7 +206,7 @@ def _turned(solution: Solution) -> Solution:
     if solution.state.model == "none":
         return solution
     turned = try_mirrored(solution.problem, solution.adjusted)
-    return solution if turned is solution.adjusted else replace(solution, adjusted=turned)
+    return solution if turned.state is solution.state else replace(solution, adjusted=turned)
 
 
 def shows_skew(solution: Solution) -> bool:

@@ -36,7 +36,7 @@ from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, error_of_view, why_odd
-from neurocal_cli.calibration.point_errors import FLOOR, largest_expected, point_errors, rms
+from neurocal_cli.calibration.point_errors import FLOOR, PointErrors, largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import MISFIT, TOLD, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
@@ -96,8 +96,11 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
         if solution.spare_equations <= 0:
             raise
         return solution, _rejected(problem.points, kept, solution)
-    contradicts = _contradicts_noise(first)
-    if not (contradicts or _is_rough(first)):
+    errors = None if first.refusal else point_errors(first, problem.points)
+    contradicts = errors is None or _contradicts_noise(first, errors)
+    # So large errors may hide outliers.
+    rough = errors is None or errors.rms > _ROUGH * pixel_spread(problem.points)
+    if not (contradicts or rough):
         return first, Rejected()
     try:
         kept, solution = _searched(problem, options, first, None)
@@ -111,7 +114,7 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
         better = contradicts or rms(solution) < _FALLS * rms(first)
     if not better:
         return first, Rejected()
-    return replace(solution, of_all=first), _rejected(problem.points, kept, solution)
+    return solution.noted(of_all=first), _rejected(problem.points, kept, solution)
 
 
 def _searched(
@@ -167,24 +170,15 @@ def _is_of(points: Correspondences, view: str) -> NDArray[np.bool_]:
     return points.view_index == points.view_names.index(view)
 
 
-def _contradicts_noise(solution: Solution) -> bool:
+def _contradicts_noise(solution: Solution, errors: PointErrors) -> bool:
     """Whether anything in a fit is inconsistent with normal noise."""
-    if solution.refusal:
-        return True
-    points = solution.problem.points
-    errors = point_errors(solution, points)
-    error = errors.length
+    points, error = solution.problem.points, errors.length
     if not np.isfinite(error).all():
         return True
     everything = np.ones(len(points), dtype=bool)
     if (error >= largest_expected(errors, everything, points)[points.view_index]).any():
         return True
     return find_outlier_view(solution) is not None
-
-
-def _is_rough(solution: Solution) -> bool:
-    """Whether the error is so large that it may hide outliers."""
-    return rms(solution) > _ROUGH * pixel_spread(solution.problem.points)
 
 
 def _fitted(problem: Problem, mask: NDArray[np.bool_], options: Options) -> Solution:

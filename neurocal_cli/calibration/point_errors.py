@@ -31,9 +31,9 @@ _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 class PointErrors:
     """Weighted errors of all points [px]; infinite for points behind the camera or in views left out.
 
-    Besides its `length` (N,), each point has two `parts` (N, 2): independent errors with the same standard
-    deviation. For points measured across an edge these are the errors across and along it; the latter may be
-    far smaller, but not larger.
+    Besides its `length` (N,), each point has one or two `parts` (N, 1 or 2): independent errors with the same
+    standard deviation. For points measured across an edge these are the errors across and along it; the
+    latter may be far smaller, but not larger.
     """
 
     length: Array
@@ -42,6 +42,11 @@ class PointErrors:
     def sigma(self, rows: NDArray[np.intp]) -> float:
         """Robust standard deviation of some points, from their median error."""
         return float(median(self.parts[rows]).max()) / _ONE
+
+    @property
+    def rms(self) -> float:
+        """Weighted rms error [px]."""
+        return float(np.sqrt((self.length**2).mean()))
 
 
 def point_errors(solution: Solution, points: Correspondences) -> PointErrors:
@@ -121,8 +126,8 @@ def squared_whitened(r: Array, covariance: Array) -> Array:
 
 
 def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
-    """Two independent errors of each point with the same standard deviation; see `PointErrors`."""
-    alike = np.repeat(length[:, None] * (_ONE / _LENGTH), 2, axis=1)
+    """Independent errors of each point with the same standard deviation; see `PointErrors`."""
+    alike = length[:, None] * (_ONE / _LENGTH)
     if across is None:
         return alike
     known = np.isfinite(length) & single(across)
@@ -135,21 +140,23 @@ def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
 def largest_expected(errors: PointErrors, kept: NDArray[np.bool_], points: Correspondences) -> Array:
     """(V,) largest error expected in each view among so many normally distributed points.
 
-    The noise level is estimated per view, because all errors of a blurred view are larger.
+    The noise level is estimated per view, because all errors of a blurred view are larger. A view without an
+    error above what all views let expect needs no level of its own.
     """
     rows = np.flatnonzero(kept)
-    overall = errors.sigma(rows)
-    by_view = np.full(points.n_views, overall)
+    overall, floor = errors.sigma(rows), FLOOR * pixel_spread(points)
+    by_chance = np.sqrt(2 * np.log(len(errors.length) / _CHANCE))
+    sigma = np.full(points.n_views, overall)
     index = points.view_index[rows]
-    counts = np.bincount(index, minlength=points.n_views)
-    pieces = np.split(rows[np.argsort(index, kind="stable")], np.cumsum(counts)[:-1])
-    for view, piece in enumerate(pieces):
+    with_large = np.unique(points.view_index[errors.length >= (overall + floor) * by_chance])
+    order = np.argsort(index, kind="stable") if with_large.size else index
+    for view in with_large:
+        piece = rows[order[slice(*np.searchsorted(index, [view, view + 1], sorter=order))]]
         if len(piece) >= FEW_POINTS:
-            by_view[view] = errors.sigma(piece)
-    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + FLOOR * pixel_spread(points)
-    return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
+            sigma[view] = np.clip(errors.sigma(piece), overall, _WORST_VIEW * overall)
+    return np.asarray((sigma + floor) * by_chance)
 
 
 def rms(solution: Solution) -> float:
     """Weighted rms error [px]."""
-    return float(np.sqrt((point_errors(solution, solution.problem.points).length ** 2).mean()))
+    return point_errors(solution, solution.problem.points).rms

@@ -56,6 +56,7 @@ def calibration_of(
             problem.points, solution.target, posterior, tuple(solution.model_errors or ()),
             solution.shared, solution.by_prior, solution.target_kept,
             solution.covariance if solution.target is None else None,
+            solution.alike,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)
@@ -188,9 +189,9 @@ def _with_second_poses(
     """
     problem, adjusted = solution.problem, solution.adjusted
     seconds = second_poses(problem, adjusted)
-    if seconds is None or solution.spare_equations <= 0:
+    which, posed = seconds.views, seconds.posed
+    if not which.size or solution.spare_equations <= 0:
         return found, {}
-    which, posed = seconds
     variance = max(float(adjusted.cost.sum()) / solution.spare_equations, 1e-300)
     odds = np.exp(-0.5 * np.maximum(posed.cost - adjusted.cost[which], 0.0) / variance)
     views = problem.views.subset(which)

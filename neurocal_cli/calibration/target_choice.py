@@ -217,7 +217,7 @@ def _searched(
     found = common if choice == "flat" else _with_bends(solution, common)
     if found is not None and choice == "auto" and has_other_cause(solution, found):
         return solution, rejected
-    kept = replace(solution, target_kept=choice == "auto")
+    kept = solution.noted(target_kept=choice == "auto")
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):
         settled = None if start is None else _settled(problem, kept, rejected, options, choice, start)

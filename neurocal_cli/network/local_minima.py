@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.adjust import Adjusted, adjust
+from neurocal_cli.adjustment.adjust import Adjusted, SecondPoses, adjust
 from neurocal_cli.adjustment.cross_validation import reduced, solve_or_nan
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import squared_errors
@@ -27,9 +27,9 @@ from neurocal_cli.network.view_networks import Group
 # test_refusals.py: no start that won there was behind after so many steps, no mirrored pose won from
 # beyond this range, and no correct data were called mirrored.
 _TRIAL_STEPS = 15  # another start must be better after so many steps
-# A mirrored pose is a candidate while its rms error is below _FLIP_RANGE times the other's, and after
-# _FLIP_STEPS steps below _FLIP_CLOSE times.
-_FLIP_RANGE, _FLIP_STEPS, _FLIP_CLOSE = 10.0, 3, 2.0
+# Further steps of a mirrored pose, and how many times the other's its rms error may be after them.
+_FLIP_RANGES = ((0, 10.0), (3, 2.0), (200, 2.0))
+_SAME = 1e-4  # rotations whose entries differ by less are of one minimum
 _FLIPS, _FLIPS_WITH_CAMERA = 12, 3  # rounds of flipping poses, and views tried in each
 # Data count as mirrored if a mirrored camera's rms error is so many times lower, with at least so many
 # points, so that it is not by chance.
@@ -116,63 +116,50 @@ def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
     if not problem.free_poses:
         return adjusted
     for _ in range(_FLIPS):
-        found = _flip_alone(problem, adjusted)
-        if found is None:
-            return adjusted
-        turned, others = found
+        second = second_poses(problem, adjusted)
+        turned = _flip_alone(problem, adjusted, second)
         if turned is None:
-            turned = _flip_with_camera(problem, adjusted, others)
+            turned = _flip_with_camera(problem, adjusted, second)
         if turned is None:
-            return adjusted
+            return replace(adjusted, second=second)
         adjusted = turned
     return adjusted
 
 
-_Second = tuple[NDArray[np.intp], Adjusted]  # views, and their second poses with the camera as it is
-
-
-def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, _Second] | None:
-    """Flip all views whose mirrored pose fits better with the current camera; and all near mirrored poses."""
-    found = second_poses(problem, adjusted)
-    if found is None:
-        return None
-    candidates, posed = found
-    better = posed.cost < adjusted.cost[candidates] * (1 - 1e-9)
-    again = _with_poses(problem, adjusted, candidates[better], posed, better) if better.any() else None
-    return again, found
-
-
-def second_poses(problem: Problem, adjusted: Adjusted) -> _Second | None:
-    """Views of flat targets whose mirrored pose fits nearly as well, and these poses; None if there are none.
-
-    The camera stays as it is.
-    """
+def second_poses(problem: Problem, adjusted: Adjusted) -> SecondPoses:
+    """The views of flat targets whose mirrored pose fits nearly as well, and these poses."""
     views, state = problem.views, adjusted.state
-    flat = np.flatnonzero(views.nearly_flat)
-    if not flat.size or not problem.free_poses:
-        return None
-    R, t = state.R.copy(), state.t.copy()
-    R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
-    # Points behind the camera's plane lie far from their pixels, or are nan.
-    cost = squared_errors(views.batches, replace(state, R=R, t=t))
-    near = cost < _FLIP_RANGE**2 * adjusted.cost + 1e-20
-    candidates, no_camera = np.flatnonzero(near & views.nearly_flat), np.zeros(5 + len(state.k), dtype=bool)
-    for steps in (_FLIP_STEPS, 200):
+    if adjusted.second is not None and adjusted.second.at is state:
+        return adjusted.second
+    candidates = np.flatnonzero(views.nearly_flat & problem.free_poses)
+    R, t = state.R[candidates], state.t[candidates]
+    mirrored = replace(state, R=_mirrored(R, t, views.basis[candidates]), t=t)
+    unsettled, no_camera = np.zeros(len(candidates), dtype=bool), np.zeros(5 + len(state.k), dtype=bool)
+    posed = Adjusted(mirrored, adjusted.normal[candidates], adjusted.cost[candidates], 0, unsettled)
+    for steps, most in _FLIP_RANGES:
         if not candidates.size:
-            return None
-        mirrored = replace(state, R=R[candidates], t=t[candidates])
-        posed = adjust(views.subset(candidates).batches, mirrored, no_camera, max_iterations=steps)
-        R[candidates], t[candidates] = posed.state.R, posed.state.t
-        close = posed.cost < _FLIP_CLOSE**2 * adjusted.cost[candidates] + 1e-20
-        if steps == _FLIP_STEPS:
-            candidates = candidates[close]
-    return candidates, posed
+            break
+        batches = (views if len(candidates) == views.n_views else views.subset(candidates)).batches
+        if steps:
+            posed = adjust(batches, posed.state, no_camera, max_iterations=steps)
+        else:  # points behind the camera's plane lie far from their pixels, or are nan
+            posed = replace(posed, cost=squared_errors(batches, posed.state))
+        close = posed.cost < most**2 * adjusted.cost[candidates] + 1e-20
+        close &= (np.abs(posed.state.R - state.R[candidates]) > _SAME).any(axis=(1, 2))
+        candidates, posed = candidates[close], posed.of_views(close)
+    return SecondPoses(state, candidates, posed)
 
 
-def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:
+def _flip_alone(problem: Problem, adjusted: Adjusted, second: SecondPoses) -> Adjusted | None:
+    """Flip all views whose mirrored pose fits better with the current camera; None if that is no better."""
+    better = second.posed.cost < adjusted.cost[second.views] * (1 - 1e-9)
+    return _with_poses(problem, adjusted, second, better) if better.any() else None
+
+
+def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: SecondPoses) -> Adjusted | None:
     """Flip the view with the largest predicted gain if the camera is adjusted, too; None if none improves."""
-    views, posed = second
-    if not problem.free_camera.any() or problem.penalty is not None:
+    views, posed = second.views, second.posed
+    if not views.size or not problem.free_camera.any() or problem.penalty is not None:
         return None
     free = problem.free if adjusted.state.model == "none" else problem.free_camera
     one, two = (reduced(normal, free, True) for normal in (adjusted.normal, posed.normal))
@@ -183,19 +170,19 @@ def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: _Second) -> 
     for place in order[:_FLIPS_WITH_CAMERA]:
         if not promised[place] < adjusted.cost.sum() * (1 - 1e-9):
             return None
-        again = _with_poses(problem, adjusted, views[[place]], posed, np.array([place]))
+        again = _with_poses(problem, adjusted, second, np.array([place]))
         if again is not None:
             return again
     return None
 
 
 def _with_poses(
-    problem: Problem, adjusted: Adjusted, views: NDArray[np.intp], posed: Adjusted, rows: NDArray[Any]
+    problem: Problem, adjusted: Adjusted, second: SecondPoses, rows: NDArray[Any]
 ) -> Adjusted | None:
-    """Adjust again with other poses of some views; None if that is no better."""
-    state = adjusted.state
+    """Adjust again with some of the second poses; None if that is no better."""
+    state, views, posed = adjusted.state, second.views[rows], second.posed.state
     R, t = state.R.copy(), state.t.copy()
-    R[views], t[views] = posed.state.R[rows], posed.state.t[rows]
+    R[views], t[views] = posed.R[rows], posed.t[rows]
     again = try_start(problem, adjusted, replace(state, R=R, t=t))
     return again if again.cost.sum() < adjusted.cost.sum() * (1 - 1e-9) else None
 

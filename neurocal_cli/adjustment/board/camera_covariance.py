@@ -66,6 +66,7 @@ class CameraSeen:
     target_kept: bool = False  # whether the given target was kept although it could have been estimated
     # From the normal matrices alone, if it is known already and the target is as given.
     plain: Covariance | None = None
+    alike: float | None = None  # correlation of the residuals of neighbouring points, if it is known already
 
 
 @frozen_dataclass(eq=False)
@@ -177,7 +178,7 @@ def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> Ca
 def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
     """Residual variance, enlarged for residuals correlated between neighbours or repeated poses."""
     views = seen.views
-    alike = correlation(views, point_residuals(views, seen.state))
+    alike = correlation(views, point_residuals(views, seen.state)) if seen.alike is None else seen.alike
     worth = effective_number(views.n_equations, alike) / views.n_equations * seen.repeated.worth
     return residual_variance(basis.normal, seen.free, seen.free_poses, basis.n_equations) / worth
 

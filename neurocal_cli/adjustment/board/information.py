@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, derivatives, free_columns
+from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, derivatives, free_columns, put_displaced
 from neurocal_cli.adjustment.views import PointBatches, Views, batches_of, products
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -36,20 +36,21 @@ def linearised(
     single row that holds for all batches. With bends (`shapes`), the rows have the derivatives by each view's
     bend. They are overwritten in the next chunk.
     """
-    buffer = batches.memory(12 + len(state.k))
+    width, more = 12 + len(state.k), 0 if shapes is None else N_SHAPES
+    buffer = batches.memory(width + more, state.square)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part[:, :-1])
+        derivatives(batches, chunk, state, part[:, :width])
         # d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
         turn = np.swapaxes(state.R[view] / scale[view][:, None, None], 1, 2)
         by_tau = part[:, POSE.start + 3 : POSE.stop]
         by_point = (turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape)  # (T, 3, 2, n)
         if shapes is not None:
             of_points = shapes[label if len(label) == 1 else label[chunk]]  # (T, n, 3, 3) or (1, n, 3, 3)
-            along = np.ascontiguousarray(np.moveaxis(of_points, 1, 3))
-            by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
-            part = np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
+            along = np.moveaxis(of_points, 1, 3)
+            part[:, -2] = part[:, width - 1]
+            put_displaced(by_point, np.ascontiguousarray(along), part[:, width - 1 : -2])
         yield chunk, part, by_point
 
 

@@ -61,7 +61,7 @@ def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
     if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
         return solution
     poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
-    if not poor and correlation(problem.views, solution.residuals) < _CORRELATED:
+    if not poor and solution.alike < _CORRELATED:
         return solution
     few = of_few_views(solution, FEW_VIEWS)
     certain = few is solution or is_elsewhere(few, solution)

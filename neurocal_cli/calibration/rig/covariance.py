@@ -45,10 +45,9 @@ from neurocal_cli.adjustment.open_choices import (
     open_at_points,
     spread_of_open,
     spread_of_stretch,
-    stretched_blocks,
     stretches,
 )
-from neurocal_cli.adjustment.reprojection import camera_columns
+from neurocal_cli.adjustment.reprojection import camera_columns, stretched_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
 from neurocal_cli.calibration.rig.problem import Observations, RigProblem, RigState
 from neurocal_cli.camera.geometry import Array
