@@ -127,14 +127,14 @@ def test_no_markers_are_no_board() -> None:
         detect_points(noise, Board((plane_of(CHARUCO),)))
 
 
-@pytest.mark.parametrize(("points", "count"), [("vertices", 36), ("midpoints", 36)])
-def test_tags_are_measured_at_their_corners_and_edges(points: str, count: int) -> None:
+@pytest.mark.parametrize(("points", "most"), [("vertices", 0.0045), ("midpoints", 0.01)])
+def test_tags_are_measured_at_their_corners_and_edges(points: str, most: float) -> None:
     scene = marked_scene(plane_of(APRIL), 5, square=45)
     picture = taken(scene, 5, 4)
     found = detect_points(picture.image, scene.board, points)  # type: ignore[arg-type]
     error, squared = errors_of(found, picture)
-    assert len(error) == count == len(set(found.ids))
-    assert np.sqrt((error**2).mean()) < 0.01
+    assert len(error) == 36 == len(set(found.ids))
+    assert np.sqrt((error**2).mean()) < most
     assert 0.4 < squared.mean() < 2
     assert {name.split(":")[0] for name in found.ids} == {str(k) for k in range(9)}
 

@@ -272,6 +272,13 @@ class SmoothMap:
         _, along = self.along(self.places(grid, direction.T))
         return np.asarray((along * (self.covariance @ along)).sum(axis=0))
 
+    def tilt_variance(self, grid: Array, step: Array, direction: Array) -> Array:
+        """Variance [px^2] of half the change along unit vectors (N, 2), from a step (2,) before to after."""
+        assert self.covariance is not None
+        after, before = (self.along(self.places(grid + way * step, direction.T))[1] for way in (1, -1))
+        change = 0.5 * (after - before)
+        return np.asarray((change * (self.covariance @ change)).sum(axis=0))
+
 
 def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
     """Fit a homography to points (N, 2) by linear least squares; affine for fewer than 4 points."""
