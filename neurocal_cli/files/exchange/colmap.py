@@ -19,48 +19,66 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError, value_failures
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
+from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_set import (
+    STILL,
+    CameraSet,
+    Format,
+    after,
+    from_quaternion,
+    to_quaternion,
+)
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import only
 from neurocal_cli.files.reading import read_bytes, read_text
+from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import number
 
-_HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
 _Lines = list[tuple[int, list[str]]]  # of a file: number and words
 
 # COLMAP's number of the model, our model, number of focal lengths, and for each of our coefficients the index
-# of COLMAP's, or None for 0.
+# of COLMAP's, or None for 0. The first that fits a camera is written.
 _MODELS: dict[str, tuple[int, str, int, tuple[int | None, ...]]] = {
-    "SIMPLE_PINHOLE": (0, "none", 1, ()),
     "PINHOLE": (1, "none", 2, ()),
+    "OPENCV": (4, "k1k2p1p2", 2, (0, 1, 2, 3)),
+    "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "OPENCV_FISHEYE": (5, "fisheye", 2, (0, 1, 2, 3)),
+    "EUCM": (16, "eucm", 2, (0, 1)),  # since version 4
+    "SIMPLE_PINHOLE": (0, "none", 1, ()),
     "SIMPLE_RADIAL": (2, "k1", 1, (0,)),
     "RADIAL": (3, "k1k2", 1, (0, 1)),
-    "OPENCV": (4, "k1k2p1p2", 2, (0, 1, 2, 3)),
-    "OPENCV_FISHEYE": (5, "fisheye", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
     "SIMPLE_RADIAL_FISHEYE": (8, "fisheye", 1, (0, None, None, None)),
     "RADIAL_FISHEYE": (9, "fisheye", 1, (0, 1, None, None)),
-    # Since version 4.
-    "SIMPLE_FISHEYE": (14, "fisheye", 1, (None, None, None, None)),
-    "FISHEYE": (15, "fisheye", 2, (None, None, None, None)),
-    "EUCM": (16, "eucm", 2, (0, 1)),
+    "SIMPLE_FISHEYE": (14, "fisheye", 1, (None, None, None, None)),  # since version 4
+    "FISHEYE": (15, "fisheye", 2, (None, None, None, None)),  # since version 4
 }
 _OTHERS = {
     7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION",
     13: "DIVISION", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
 _LINE = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
-_NAMES = {
-    "none": "PINHOLE",
-    "k1k2p1p2": "OPENCV",
-    "rational": "FULL_OPENCV",
-    "fisheye": "OPENCV_FISHEYE",
-    "eucm": "EUCM",
-}
+
+
+# A camera as pycolmap and hloc have it in a dictionary.
+_KEYS = CameraKeys(
+    "COLMAP",
+    (),
+    tuple(
+        Lens(
+            (name,),
+            ours,
+            tuple(NOTHING if k is None else f"params/{focal + 2 + k}" for k in places),
+            tuple(f"params/{k}" for k in (0, focal - 1, focal, focal + 1)),
+        )
+        for name, (_, ours, focal, places) in _MODELS.items()
+    ),
+    model="model",
+    size=("width", "height"),
+    first_pixel=0.5,
+)
 
 
 def is_folder(name: str) -> bool:
@@ -119,9 +137,8 @@ def read_file(document: Document) -> CameraSet:
     """Read ``cameras.txt`` or ``cameras.bin`` with one camera."""
     source = document.source
     if (stated := _stated_model(document)) is not None:
-        sides = [document.root[side].integer(1) for side in ("width", "height")]
-        words = ["1", stated, *map(str, sides), *map(repr, document.root["params"].array(-1).tolist())]
-        return CameraSet((_camera(words, source, 1),), program="COLMAP")
+        camera = Field({**document.tree, "model": stated}, source)
+        return CameraSet((_KEYS.camera(camera, "camera1"),), program="COLMAP")
     if (sensors := _sensors(document)) is not None:
         return only(list(sensors.values()), sensors, "kapture")
     lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
@@ -166,9 +183,8 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
             raise FormatError(
                 f"the camera model {other} is not known; use one of {', '.join(names.values())}", source
             )
-        _, _, focal, places = _MODELS[names[model]]
         yield from (one, names[model], width, height)
-        yield from take(f"{focal + 2 + len([p for p in places if p is not None])}d")
+        yield from take(f"{_count(names[model])}d")
 
     def images() -> Iterator[object]:
         nonlocal place
@@ -219,19 +235,22 @@ def _camera(words: list[str], source: str, line: int) -> Camera:
     if model not in _MODELS:
         known = ", ".join(_MODELS)
         raise FormatError(f"the camera model {model[:40]!r} is not known; use one of {known}", source, line)
-    _, ours, focal, places = _MODELS[model]
     try:
-        size = int(words[2]), int(words[3])
-        values = np.array(words[4:], dtype=float)
-        if len(values) != focal + 2 + len([p for p in places if p is not None]):
+        values = [float(word) for word in words[4:]]
+        if len(values) != _count(model) or not np.isfinite(values).all():
             raise ValueError
+        tree = {"model": model, "width": int(words[2]), "height": int(words[3]), "params": values}
     except (ValueError, IndexError) as error:
         raise FormatError(
             f"is not the line of a camera with the model {model}; correct it", source, line
         ) from error
-    f, (cx, cy), k = values[:focal], values[focal : focal + 2] - _HALF, values[focal + 2 :]
-    coefficients = np.array([0.0 if p is None else k[p] for p in places])
-    return Camera(Intrinsics(f[0], f[-1], cx, cy), Distortion(ours, coefficients), size, f"camera{words[0]}")
+    return _KEYS.camera(Field(tree, source), f"camera{words[0]}")
+
+
+def _count(model: str) -> int:
+    """Number of the parameters of a model."""
+    _, _, focal, places = _MODELS[model]
+    return focal + 2 + len([k for k in places if k is not None])
 
 
 def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
@@ -243,7 +262,7 @@ def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
         raise FormatError("holds several rigs; give a model with one", source)
     line, words = rows[0]
     try:
-        poses, rest = {int(words[3]): Pose(np.eye(3), np.zeros(3))}, words[4:]
+        poses, rest = {int(words[3]): STILL}, words[4:]
         while rest:
             if rest[0] != "CAMERA" or rest[2] != "1":
                 raise FormatError("a sensor is no camera, or has no pose", source, line)
@@ -282,11 +301,9 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
     ]
     for k, camera in enumerate(cameras.cameras, start=1):
-        width, height = camera.image_size or (0, 0)
-        a, _, b, u0, v0 = camera.entries
-        values = [a, b, u0 + _HALF, v0 + _HALF, *camera.distortion.coefficients.tolist()]
-        model = _NAMES[camera.distortion.model]
-        lines.append(f"{k} {model} {width} {height} {' '.join(map(number, values))}")
+        tree = _KEYS.tree(camera)
+        words = tree["model"], tree["width"], tree["height"], *map(number, tree["params"])
+        lines.append(f"{k} {' '.join(map(str, words))}")
     if len(cameras.cameras) == 1 and not cameras.poses:
         return {"": _joined(lines)}
     files = {"cameras.txt": lines}
@@ -323,7 +340,7 @@ def _seven(pose: Pose) -> str:
 
 FORMAT = Format(
     "COLMAP",
-    tuple(_NAMES),
+    _KEYS.models,
     _text,
     is_cameras,
     read_file,

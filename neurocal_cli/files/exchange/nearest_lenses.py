@@ -21,8 +21,10 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_quaternion, mounted
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, mounted
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.format_table import PoseKeys
+from neurocal_cli.files.exchange.tree_paths import in_order
 from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field, is_number
 
@@ -104,38 +106,36 @@ def _read_ocam(document: Document) -> CameraSet:
 
 
 # WoodScape: the radius [px] is a polynomial of the angle [rad], about a point from the middle of the image.
-# The pose is that of the camera in the vehicle, the quaternion x, y, z, w.
-_WOODSCAPE_KEYS = {"model", "k1", "k2", "k3", "k4", "cx_offset", "cy_offset", "width", "height"}
+# The pose is that of the camera in the vehicle.
+_WOODSCAPE = ("k1", "k2", "k3", "k4", "cx_offset", "cy_offset", "width", "height")
+_IN_VEHICLE = PoseKeys(("quaternion", "translation"), back=True)
 
 
 def _is_woodscape(document: Document) -> bool:
     own = document.tree.get("intrinsic")
-    return isinstance(own, dict) and own.keys() >= _WOODSCAPE_KEYS and own["model"] == "radial_poly"
+    return isinstance(own, dict) and own.keys() >= set(_WOODSCAPE) and own.get("model") == "radial_poly"
 
 
 def _read_woodscape(document: Document) -> CameraSet:
     root = document.root
     own = root["intrinsic"]
+    *k, u0, v0, _, _ = (own[key].number() for key in _WOODSCAPE)
     width, height = own["width"].integer(1), own["height"].integer(1)
-    k = np.array([0.0, *(own[f"k{n}"].number() for n in (1, 2, 3, 4))])
+    u0, v0 = u0 + 0.5 * (width - 1), v0 + 0.5 * (height - 1)
     aspect = own.get("aspect_ratio", 1.0).number()
-    u0, v0 = (
-        0.5 * (side - 1) + own[key].number() for side, key in ((width, "cx_offset"), (height, "cy_offset"))
-    )
     far = np.hypot(max(u0, width - u0), max(v0, height - v0) / aspect)
     theta = np.linspace(0, np.pi, 4 * _SAMPLES)
-    radius = np.polynomial.polynomial.polyval(theta, k)
+    radius = np.polynomial.polynomial.polyval(theta, np.array([0.0, *k]))
     end = int(np.argmax((radius > far) | (np.gradient(radius) <= 0))) or len(theta)
     f, lens = fitted(theta[:end], radius[:end], 1.0, document, "the polynomial of WoodScape")
     camera = Camera(
         Intrinsics(f, f * aspect, u0, v0), lens, (width, height), root.get("name", "camera").text()
     )
-    if "extrinsic" not in root:
-        return CameraSet((camera,), program="WoodScape")
-    body = root["extrinsic"]
-    R = from_quaternion(np.roll(body["quaternion"].array(4), 1))
-    pose = Pose(R.T, -R.T @ body["translation"].array(3))
-    return mounted([camera], [pose], "WoodScape", "m", "vehicle")
+    body = root.get("extrinsic", {})
+    if "quaternion" in body:  # x, y, z, w
+        x, y, z, w = body["quaternion"].array(4).tolist()
+        body = Field({**body.value, "quaternion": [w, x, y, z]}, root.source, "extrinsic")
+    return mounted([camera], [_IN_VEHICLE.read(body)], "WoodScape", "m", "vehicle")
 
 
 WOODSCAPE = Format(
@@ -156,7 +156,9 @@ OCAM = Format(
 )
 
 
-_ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines: place, angles, R, principal point, f, glass
+_ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines
+_ORDER = "place:3 angles:3 R:9 centre:2 f glass:3"
+_LENS = "k1 k2 k3 p1 p2 scale shear"
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _GRID = 15  # rays along each side of the image
 _PAR = ("ptv.par", "../parameters/ptv.par", "parameters/ptv.par", "../ptv.par")
@@ -186,35 +188,35 @@ def _pixels(path: Path) -> tuple[list[float], bool]:
 
 
 def _read(document: Document) -> CameraSet:
-    values = Field(document.text.split(), document.source, "the file").array(sum(_ORIENTATION))
+    own = in_order(_ORDER, document.text.split(), document.source)
     path = Path(document.source)
     (width, height, du, dv), broken = _pixels(path)
     lens = path.with_suffix(".addpar")
-    k = np.array([0, 0, 0, 0, 0, 1.0, 0])  # k1, k2, k3, p1, p2, scale, shear
+    k = Field({**dict.fromkeys(_LENS.split(), 0.0), "scale": 1.0}, document.source)
     if lens.exists():
         text, source = read_text(lens)
-        k = Field(text.split(), source, "the file").array(7)
+        k = in_order(_LENS, text.split(), source)
     else:
         document.warnings.append(f"{document.source}: there is no {lens.name}, so it has no distortion")
-    centre, f = values[15:17], float(values[17])
-    camera = _camera(centre, f, k, (int(width), int(height)), (du, dv), document, path.name.split(".")[0])
-    R = _FLIP @ values[6:15].reshape(3, 3).T
+    size, side, name = (int(width), int(height)), (du, dv), path.name.split(".")[0]
+    camera = _camera(own["centre"].array(2), own["f"].number(), k, size, side, document, name)
+    R = _FLIP @ own["R"].array(9).reshape(3, 3).T
     if broken:
         document.notes.append(f"{document.source}: rays are broken at glass, so its pose is left out")
-    pose = None if broken else Pose(R, -R @ values[:3])
+    pose = None if broken else Pose(R, -R @ own["place"].array(3))
     return mounted([camera], [pose], "OpenPTV", "mm", "world")
 
 
 def _camera(
     centre: Array,
     f: float,
-    k: Array,
+    lens: Field,
     size: tuple[int, int],
     side: tuple[float, float],
     document: Document,
     name: str,
 ) -> Camera:
-    k1, k2, k3, p1, p2, scale, shear = k.tolist()
+    k1, k2, k3, p1, p2, scale, shear = (lens[key].number() for key in _LENS.split())
     affine = np.array([[scale, np.sin(shear)], [0.0, np.cos(shear)]]) / np.array(side)[:, None]
     middle = 0.5 * np.array(size) - 0.5
     origin = centre * [1, -1]  # y down
@@ -224,11 +226,9 @@ def _camera(
         return Intrinsics.from_matrix(np.array([[a, skew, u0], [0.0, b, v0], [0.0, 0.0, 1.0]]))
 
     start = np.array([*(f * affine).ravel()[[0, 1, 3]], *(affine @ origin + middle)])
-    lens = np.array([k1 * f**2, k2 * f**4, -p2 * f, p1 * f, k3 * f**6])
-    exact = Camera(
-        intrinsics(start), Distortion("plumb_bob", lens) if lens.any() else Distortion(), size, name
-    )
-    if not (lens.any() and origin.any()):
+    k = np.array([k1 * f**2, k2 * f**4, -p2 * f, p1 * f, k3 * f**6])
+    exact = Camera(intrinsics(start), Distortion("plumb_bob", k) if k.any() else Distortion(), size, name)
+    if not (k.any() and origin.any()):
         return exact
     # Pixels of rays by OpenPTV's formula, and the camera of OpenCV's that is nearest to them.
     from scipy.optimize import least_squares
@@ -252,7 +252,7 @@ def _camera(
         return (np.nan_to_num(of(values).project(rays)[0], nan=1e6) - pixels).ravel()
 
     unit = np.array([*np.maximum(np.abs(start), 1.0), 0.1, 0.1, 0.01, 0.01, 0.1])
-    found = least_squares(errors, np.array([*start, *lens]), x_scale=unit)
+    found = least_squares(errors, np.array([*start, *k]), x_scale=unit)
     worst = float(np.hypot(*found.fun.reshape(-1, 2).T).max())
     if worst > _WORST:
         raise InputError(

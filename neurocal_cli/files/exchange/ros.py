@@ -24,6 +24,12 @@ from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field, is_number
 
 _TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)  # of ost.txt
+# The lines above the numbers, our keys of these, and how many there are.
+_BLOCKS = {
+    "width": ("image_width", 1), "height": ("image_height", 1), "camera matrix": ("camera_matrix", 9),
+    "distortion": ("distortion_coefficients", -1), "rectification": ("rectification_matrix", 9),
+    "projection": ("projection_matrix", 12),
+}  # fmt: skip
 _LABEL = re.compile(r"\s*\[?([A-Za-z][\w /.-]*)\]?\s*").fullmatch
 
 
@@ -71,31 +77,16 @@ def _ost(document: Document) -> Field:
                 name = line
         elif line:
             tree.setdefault(name, []).extend(line.split())
-    known = {
-        "camera matrix": 9,
-        "distortion": -1,
-        "rectification": 9,
-        "projection": 12,
-        "width": 1,
-        "height": 1,
+    root = Field({name: tree[name] for name in _BLOCKS if name in tree}, document.source)
+    read = {key: root[name].array(count).tolist() for name, (key, count) in _BLOCKS.items() if name in root}
+    root["camera matrix"], root["distortion"]
+    rational = len(read["distortion_coefficients"]) > 5
+    own = {
+        "camera_name": tree.get("camera_name", "camera"),
+        "distortion_model": "rational_polynomial" if rational else "plumb_bob",
     }
-    root = Field(
-        {key: value for key, value in tree.items() if key in known or key == "camera_name"}, document.source
-    )
-    read = {key: root[key].array(count) for key, count in known.items() if key in root}
-    return Field(
-        {
-            "camera_name": tree.get("camera_name", "camera"),
-            "image_width": int(read["width"][0]) if "width" in read else 0,
-            "image_height": int(read["height"][0]) if "height" in read else 0,
-            "camera_matrix": read["camera matrix"].tolist(),
-            "distortion_model": "rational_polynomial" if len(read.get("distortion", ())) > 5 else "plumb_bob",
-            "distortion_coefficients": root["distortion"].array(-1).tolist(),
-            **({"rectification_matrix": read["rectification"].tolist()} if "rectification" in read else {}),
-            **({"projection_matrix": read["projection"].tolist()} if "projection" in read else {}),
-        },
-        document.source,
-    )
+    sides = {key: int(read.pop(key, [0])[0]) for key in ("image_width", "image_height")}
+    return Field({**own, **sides, **read}, document.source)
 
 
 def joined(left: CameraSet, right: CameraSet) -> CameraSet:

@@ -182,7 +182,7 @@ _KINECT = CameraKeys(
     size=("size",),
     first_pixel=0.5,
 )
-_KINECT_ORDER = "cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1"
+_KINECT_ORDER = "cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1 rest:"
 
 
 def _kinect_parts(document: Document) -> dict[str, Field]:

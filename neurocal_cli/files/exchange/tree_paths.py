@@ -104,7 +104,6 @@ def in_order(table: str, words: Any, source: str) -> Field:
     """The tree of numbers that a file has in a fixed order.
 
     A table is ``"fx fy R:9 D:"``: single numbers, lists of a length, and perhaps a list of all that follow.
-    Without it, further numbers are not read.
     """
     values = numbers(Field(words, source)).tolist()
     tree: dict[str, Any] = {}
@@ -112,8 +111,10 @@ def in_order(table: str, words: Any, source: str) -> Field:
         name, listed, count = entry.partition(":")
         end = int(count or len(values)) if listed else 1
         if len(values) < end:
-            raise FormatError(f"holds too few numbers, and none for {name}; write it again", source)
+            raise FormatError(f"holds too few numbers, and not all of {name}; write it again", source)
         tree[name], values = (values[:end] if listed else values[0]), values[end:]
+    if values:
+        raise FormatError(f"holds {len(values)} numbers too many; write it again", source)
     return Field(tree, source)
 
 
