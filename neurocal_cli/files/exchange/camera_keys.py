@@ -62,6 +62,12 @@ class CameraKeys:
         plain = [] if set(ours).isdisjoint(_POLYNOMIAL) else ["none"]
         return tuple(dict.fromkeys([*plain, *ours]))
 
+    @property
+    def top(self) -> frozenset[str]:
+        """The first keys of the paths of the lens, the intrinsics and the size."""
+        paths = *self.intrinsics, *self.size, *split(self.model)
+        return frozenset(path.partition(":")[0].partition("/")[0] for path in paths if path)
+
     def camera(self, root: Field, name: str = "camera") -> Camera:
         """Read a camera."""
         lens = self._lens(root)

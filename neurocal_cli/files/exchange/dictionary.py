@@ -31,7 +31,7 @@ from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
 from neurocal_cli.files.exchange.camera_names import PARAMETERS, plain, plain_lists
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted, to_vector
-from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document
+from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field
@@ -334,7 +334,7 @@ def _within(root: Field, notes: list[str]) -> Field:
             if keys.has_camera() or _sides(keys) is not None or any(map(keys.has_camera, "12lr")):
                 break
         elif not isinstance(value, list):
-            raise InputError(UNKNOWN)
+            raise NoCameraError(UNKNOWN)
         named = value.items() if isinstance(value, dict) else enumerate(value)
         parts = {str(name): part for name, part in named if _holds_camera(part)}
         if not parts:
@@ -362,7 +362,7 @@ def _within(root: Field, notes: list[str]) -> Field:
             }
         root = Field(part, root.source)
     if not isinstance(root.value, dict):
-        raise InputError(UNKNOWN)
+        raise NoCameraError(UNKNOWN)
     return root
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.reading import decode, is_point_table, read_bytes
 from neurocal_cli.files.tree_fields import Field, is_number
@@ -61,6 +61,10 @@ _PRINTED = re.compile(r"\[\[[-+.\deE\s\[\]]+\]\]")
 def _with_commas(printed: re.Match[str]) -> str:
     rows = re.findall(r"\[\[?([^\[\]]+)\]", printed[0])
     return f" [{', '.join('[' + ', '.join(row.split()) + ']' for row in rows)}]"
+
+
+class NoCameraError(InputError):
+    """A file in which no camera is found."""
 
 
 class Document:

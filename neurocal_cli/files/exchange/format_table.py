@@ -168,10 +168,15 @@ def table(
         return {"": write(whole(trees, cameras))}
 
     wanted = set(matches.split()) if isinstance(matches, str) else set()
-    found = {"models": keys.models, "skew": bool(keys.skew), "first_pixel": keys.first_pixel}
+    found = {
+        "keys": keys.top,
+        "models": keys.models,
+        "skew": bool(keys.skew),
+        "first_pixel": keys.first_pixel,
+    }
     made = {"read": read, **({} if write is None else {"text": text}), **found, **properties}
     told = (lambda document: wanted <= set(document.tree)) if isinstance(matches, str) else matches
-    return Format(keys.program, matches=told, files=files, **made)
+    return Format(keys.program, matches=told, files=files, **{**made, **properties})
 
 
 def only(cameras: Sequence[Camera], names: Mapping[str, Any], program: str) -> CameraSet:

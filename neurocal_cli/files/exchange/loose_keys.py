@@ -55,7 +55,7 @@ from neurocal_cli.files.exchange.camera_names import (
     parameters_apart,
     plain,
 )
-from neurocal_cli.files.exchange.document import camera_matrix
+from neurocal_cli.files.exchange.document import NoCameraError, camera_matrix
 from neurocal_cli.files.tree_fields import Field
 
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
@@ -207,7 +207,7 @@ class LooseKeys:
             )
         if field is None:
             keys = ", ".join(str(key)[:30] for key in list(self.root.value)[:6])
-            raise InputError(
+            raise NoCameraError(
                 "holds no camera matrix; give a file with the key camera_matrix, cameraMatrix or K"
                 f"{f' (its keys are {one_line(keys)})' if keys else ''}"
             )

@@ -29,7 +29,7 @@ from neurocal_cli.files.exchange import (
     sensors,
 )
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, adapt_cameras, after, inverse
-from neurocal_cli.files.exchange.document import UNKNOWN, Document
+from neurocal_cli.files.exchange.document import UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.neurocal import camera_set
 from neurocal_cli.files.tree_fields import Field
 
@@ -225,6 +225,13 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
 )
 
 
+# Keys that tell no format.
+_COMMON = {
+    "fx", "fy", "cx", "cy", "K", "D", "S", "model", "size", "width", "height", "w", "h", "image_width",
+    "image_height",
+}  # fmt: skip
+
+
 def _is(document: Document, sign: bytes | str | Callable[[Document], object]) -> object:
     """Whether a document has the sign of a kind of files."""
     if isinstance(sign, bytes):
@@ -328,7 +335,10 @@ def _read(document: Document, whole: bool = True) -> CameraSet:
             if one.matches is None or one.read is None or not one.matches(document):
                 continue
             own = not whole and one is neurocal.FORMAT
-            found = neurocal.from_tree(document.root, whole) if own else one.read(document)
+            try:
+                found = neurocal.from_tree(document.root, whole) if own else one.read(document)
+            except NoCameraError as error:
+                raise InputError(f"{error}{_nearest(document)}") from error
             for camera in found.cameras:
                 model = document.distortion
                 if model is not None and with_model(camera.distortion, model) is None:
@@ -337,6 +347,18 @@ def _read(document: Document, whole: bool = True) -> CameraSet:
                     )
             return found
     raise FormatError(UNKNOWN, document.source)
+
+
+def _nearest(document: Document) -> str:
+    """The format most of whose keys are in a file that is none, and those that it lacks; "" without any."""
+    tree = document.tree
+    there = {str(key) for part in (tree, *tree.values()) if isinstance(part, dict) for key in part}
+    one = max(READ, key=lambda one: len(one.keys & there) / max(len(one.keys), 1))
+    own = one.keys - _COMMON
+    lacks = sorted(own - there)
+    if not 0 < len(lacks) <= len(own & there):
+        return ""
+    return f"; of the known formats {one.program} is the nearest, which has {', '.join(lacks[:4])} as well"
 
 
 def _merged(documents: Sequence[Document]) -> CameraSet | None:
