@@ -126,10 +126,11 @@ def convert(
                 the files of these programs
       lensfun   database of one lens, XML
 
-    Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI, Middlebury, MVSNet, OpenMVG,
-    Meshroom, OpenSfM, OpenDroneMap, BoofCV, multical, calib.io, EasyMocap, mmpose, OpenPTV, ZED, OAK,
-    Azure Kinect, RealSense, freemocap, instant-ngp, Nerfies, Polycam, PhotonVision, Waymo, Bouguet's
-    toolbox, numbers that OpenCV and NumPy print, and as the nearest fisheye OCamCalib and the FOV model.
+    Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI, Argoverse, nuScenes, ZOD, Middlebury,
+    MVSNet, OpenMVG, Meshroom, OpenSfM, OpenDroneMap, BoofCV, multical, calib.io, EasyMocap, mmpose, OpenPTV,
+    ZED, OAK, Azure Kinect, RealSense, freemocap, instant-ngp, Nerfies, Polycam, PhotonVision, Waymo,
+    Bouguet's toolbox, numbers that OpenCV and NumPy print, and as the nearest fisheye OCamCalib and the FOV
+    model.
 
     If the format lacks the distortion model, the command fails and says how many pixels the nearest camera
     differs. --force writes that camera; --model writes the nearest camera of a chosen model, for programs

@@ -306,6 +306,8 @@ def _check_names(names: list[str], schema: Schema) -> None:
         hint += f", and name the column{'s' * (len(others) > 1)} {','.join(others)}"
     if len(missing) == len(schema.required) and not similar:
         hint += schema.instead
+    if missing == ["X", "Y", "Z"] and ({"row", "col"} <= set(names) or "point" in names):
+        hint += ", or give --board chessboard:COLSxROWS:SQUARE"
     raise InputError(
         f"column{'s' * (len(missing) > 1)} {', '.join(missing)} missing from the header "
         f"{','.join(names)[:60]!r}; {hint}"

@@ -232,6 +232,9 @@ REFUSED = {
     "cam0: {camera_model: pinhole-fov, intrinsics: [1, 1, 1, 1]}": "model 'pinhole-fov' of Kalibr is not",
     "cam0: {camera_model: ds, distortion_model: radtan, intrinsics: [1, 1, 1, 1, 1, 1]}": "'ds-radtan' of",
     "cam0: {camera_model: omni, distortion_model: none, intrinsics: [1, 1, 1, 1]}": "intrinsics",
+    KALIBR.replace(
+        "intrinsics:", "intrin:"
+    ): "of the known formats Kalibr is the nearest, which has intrinsics",
     KALIBR.replace("radtan", "fov"): "the model 'pinhole-fov' of Kalibr is not known",
     "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0}\nmodel: kannala_brandt\n": "'kannala_brandt'",
     "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0}\nmirror_offset: 1.2": "mirror_offset'",

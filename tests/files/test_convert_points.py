@@ -459,6 +459,23 @@ def test_a_table_is_one_of_points_whatever_the_order_of_its_columns(tmp_path: Pa
     rows = "".join(f"{8 * k + 1},{9 * k},0,{k},{2 * k % 7}\n" for k in range(12))
     (tmp_path / "a.csv").write_text(f"v,u,Z,Y,X\n{rows}")
     assert "12 points of 1 view" in run("convert", tmp_path / "a.csv", "--to", "neurocal").stderr
-    (tmp_path / "b.csv").write_text("view,row,col,u,v\na,0,0,1,2\na,0,1,3,4\n")
-    result = run("convert", tmp_path / "b.csv", "--to", "neurocal")
-    assert "columns X, Y, Z missing from the header" in result.stderr
+
+
+def test_points_by_their_place_on_the_board_need_the_board(tmp_path: Path) -> None:
+    forms = {
+        "row,col": lambda r, c: f"{r},{c}",
+        "point": lambda r, c: f"{c}:{r}",
+        "id": lambda r, c: f"{5 * r + c}",
+    }
+    forms |= {"row,col ": lambda r, c: f"{r + 1},{c + 1}", "corner_id": lambda r, c: f"{5 * r + c + 1}"}
+    texts = set()
+    for head, form in forms.items():
+        rows = "".join(f"a,{form(r, c)},{c + 1},{r * c}\n" for r in range(4) for c in range(5))
+        (tmp_path / "b.csv").write_text(f"view,{head},u,v\n{rows}")
+        result = run("convert", tmp_path / "b.csv", "--to", "neurocal")
+        assert ("or give --board chessboard" in result.stderr) == (head != "id")
+        texts.add(run("convert", tmp_path / "b.csv", "--to", "neurocal", *SIZE).stdout)
+    assert len(texts) == 1
+    assert "a,4:3,100.0,75.0,0.0,5.0,12.0\n" in next(iter(texts))
+    wrong = run("convert", tmp_path / "b.csv", "--to", "neurocal", "--board", "chessboard:4x3:25")
+    assert "b.csv:14: is no vertex of a board of 4 x 3" in wrong.stderr

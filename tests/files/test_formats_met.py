@@ -115,6 +115,14 @@ def argoverse(R: Array, t: Array) -> Any:
     return {**dict(zip(names, FXY.values(), strict=True)), **lens, "vehicle_SE3_camera_": body}
 
 
+def nuscenes(name: str, R: Array, t: Array) -> Any:
+    """A sensor with the pose R X + t of the vehicle."""
+    x, y, z, w = Rotation.from_matrix(R.T).as_quat()
+    back = {"translation": (-R.T @ t).tolist(), "rotation": [w, x, y, z]}
+    return {"token": "a", "sensor_token": name, **back, "camera_intrinsic": K}
+
+
+EMPTY: dict[str, Any] = {"camera_intrinsic": []}
 PIX4D = (
     "fileName imageWidth imageHeight\ncamera matrix K [3x3]\nradial distortion [3x1]\ntangential distortion "
     "[2x1]\ncamera position t [3x1]\ncamera rotation R [3x3]\ncamera model m = K [R|-Rt] X\n\n"
@@ -126,6 +134,20 @@ PIX4D = (
 DEWARP = f"2020-09-02;800.5,801.25,1.8,-0.8,{','.join(map(str, D5))}"
 # Of each kind: the text or the tree, the entries of its camera, the coefficients, and the size.
 MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
+    "ZOD": (
+        {
+            "FC": {
+                "extrinsics": EYE,
+                "intrinsics": [[*row, 0] for row in K],
+                "distortion": FOUR,
+                "undistortion": [0.1, 0.2, 0.3, 0.4],
+                "image_dimensions": [640, 480],
+            }
+        },
+        E,
+        FISH,
+        S,
+    ),
     "OpenCV in ROS parameters": (
         {
             "/**": {
@@ -747,6 +769,15 @@ RIGS: dict[str, tuple[Any, list[float], list[Array]]] = {
             "vehicle_SE3_up_lidar_": {},
         },
         [*D5[:2], 0, 0, D5[4]],
+        [TURNED],
+    ),
+    "nuScenes": (
+        [
+            nuscenes("CAM_0", np.eye(3), np.zeros(3)),
+            {**nuscenes("LIDAR", np.eye(3), np.zeros(3)), **EMPTY},
+            nuscenes("CAM_1", np.array(R), np.array(SHIFT)),
+        ],
+        [],
         [TURNED],
     ),
     "entries of two sides": (

@@ -28,9 +28,10 @@ from neurocal_cli.files.exchange.camera_names import SHAPE, plain
 from neurocal_cli.files.exchange.document import array_of, arrays_of, camera_matrix, few_numbers
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
-from neurocal_cli.files.points_csv import POINTS, read_points
+from neurocal_cli.files.points_csv import PIXEL, PLACE, POINTS, correspondences, read_points
 from neurocal_cli.files.reading import decode, read_bytes
-from neurocal_cli.files.table import read_table
+from neurocal_cli.files.table import Table, read_table
+from neurocal_cli.files.table_header import find_layout
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences
@@ -53,6 +54,25 @@ _TABLE = re.compile(
     r"(?:(?=[^\n]*(?:\bX\b|x_?world|world_?x|obj))(?=[^\n]*(?:\bv\b|img|pix|v_?px|image))"
     r"|(?=[^\n]*\bu\b)(?=[^\n]*\bv\b))[^\n:#{<=]*\r?\n"
     r"|(?:[-+0-9.eE]+[ \t]*[,;\t ][ \t]*){4}[-+0-9.eE]+[ \t]*\r?(?:\n|\Z))",
+    re.IGNORECASE,
+)
+# Columns of a table whose points are told by their places on the board, and how its header looks.
+_CELLS = replace(
+    POINTS,
+    required=PIXEL,
+    optional=(*POINTS.optional, "row", "col"),
+    headerless=False,
+    aliases={name: forms for name, forms in POINTS.aliases.items() if name not in PLACE}
+    | {
+        "col": ("column", "boardcol", "colindex"),
+        "row": ("boardrow", "rowindex"),
+        "point": (*POINTS.aliases["point"], "id"),
+    },
+    others=((tuple("xy"), PIXEL),),
+)
+_BY_CELL = re.compile(
+    r"\A\ufeff?(?:#[^\n]*\n|\s*\n)*(?:(?=[^\n]*row)(?=[^\n]*col)|(?=[^\n]*(?:point|corner|id\b)))"
+    r"[^\n:#{<=]*,[^\n:#{<=]*\r?\n",
     re.IGNORECASE,
 )
 _KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
@@ -101,6 +121,8 @@ def read_corners(
         return None
     if _NUMBERS.match(text):
         return _separate(names, given)
+    if board is not None and _BY_CELL.match(text) and not _has_places(data, source):
+        return _of_cells(names, board, notes)
     if _TABLE.match(text):
         return _table_of(names, given)
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
@@ -130,6 +152,61 @@ def _table_of(names: list[str], given: _Given) -> Correspondences:
     if stated:
         raise FormatError(f"is in {points.unit}, not {given.unit}; leave out --unit", points.source)
     return replace(points, unit=str(given.unit))
+
+
+def _has_places(data: bytes, source: str) -> bool:
+    try:
+        return set(PLACE) <= set(find_layout(data, source, POINTS).names)
+    except FormatError:
+        return False
+
+
+def _of_cells(names: list[str], board: Board, notes: list[str]) -> Correspondences:
+    """Read tables of points by row and column on the board, or by their ids or numbers along its rows.
+
+    Rows, columns and numbers are counted from 1 if they go beyond the board's and none is 0.
+    """
+    if len(board.planes) != 1:
+        raise FormatError("has points by their places on a board; give a board of one plane", names[0])
+    (plane,) = board.planes
+    ids = list(plane.vertex_ids())
+    tables = [read_table(name, _CELLS) for name in names]
+    cells = [_cells(table, ids, plane.cols) for table in tables]
+    if len({one.shape[1] for one in cells}) > 1:
+        raise FormatError("tells its points otherwise than other files; give row and col in all", names[0])
+    sides = np.array([plane.cols, plane.rows]) if cells[0].shape[1] == 2 else np.array([len(ids)])
+    if all((one >= 1).all() for one in cells) and any((one >= sides).any() for one in cells):
+        cells = [one - 1 for one in cells]
+        notes.append(f"{names[0]}: counts the points of the board from 1")
+    vertices = plane.vertices().reshape(-1, 3)
+    placed = []
+    for table, cell in zip(tables, cells, strict=True):
+        wrong = ((cell < 0) | (cell >= sides) | (cell % 1 != 0)).any(axis=1)
+        if wrong.any():
+            raise FormatError(
+                f"is no vertex of a board of {plane.cols} x {plane.rows}; give the board that was measured",
+                table.source,
+                int(table.lines[np.argmax(wrong)]),
+            )
+        k = (cell @ [1, plane.cols] if cell.shape[1] == 2 else cell[:, 0]).astype(int)
+        numbers = {name: column for name, column in table.numbers.items() if name not in ("row", "col")}
+        numbers |= dict(zip(PLACE, vertices[k].T, strict=True))
+        labels = {**table.labels, "point": np.array(ids)[k]}
+        placed.append(replace(table, numbers=numbers, labels=labels))
+    return replace(correspondences(placed, notes), unit=board.unit)
+
+
+def _cells(table: Table, ids: list[str], cols: int) -> Array:
+    """Column and row (N, 2) of each point, or its number (N, 1) along the rows of the board."""
+    if {"row", "col"} <= table.numbers.keys():
+        return table.stack(("col", "row"))
+    labels = table.labels.get("point")
+    if labels is None:
+        raise FormatError("names no point of the board; add columns row and col, or point", table.source)
+    if all(map(str.isdecimal, labels.tolist())):
+        return labels.astype(float)[:, None]
+    places = {label: (k % cols, k // cols) for k, label in enumerate(ids)}
+    return np.array([places.get(label, (-1, -1)) for label in labels.tolist()], dtype=float)
 
 
 def _corners(

@@ -1,4 +1,4 @@
-"""Formats of data sets: KITTI, Argoverse, Middlebury, MVSNet, KWIVER and DROID-SLAM."""
+"""Formats of data sets: KITTI, Argoverse, nuScenes, ZOD, Middlebury, MVSNet, KWIVER, DROID-SLAM."""
 
 from __future__ import annotations
 
@@ -91,6 +91,48 @@ ARGOVERSE = table(
     ),
     most_cameras=99,
     rig="`vehicle_SE3_camera_` from each camera to the vehicle",
+)
+
+# The Zenseact Open Dataset: the camera of a car as its own programs project it, a fisheye.
+ZOD = table(
+    CameraKeys(
+        "ZOD",
+        under("intrinsics/", "0/0", "1/1", "0/2", "1/2"),
+        (Lens(("",), "fisheye", ("distortion",)),),
+        size=("image_dimensions",),
+    ),
+    lambda document: "undistortion" in (document.tree.get("FC") or ()),
+    "calibration.json of the Zenseact Open Dataset",
+    parts=lambda document: {"FC": document.root["FC"]},
+    pose=PoseKeys(("extrinsics",), back=True, frame="vehicle"),
+)
+
+
+# nuScenes: rectified cameras among the sensors of a car, quaternions w, x, y, z.
+_NUSCENES = ("camera_intrinsic", "rotation", "translation")
+
+
+def _nuscenes_parts(document: Document) -> dict[str, Field]:
+    parts: dict[str, Field] = {}
+    for entry in document.root.items():
+        if not entry["camera_intrinsic"].value:
+            continue  # another sensor
+        name = entry["sensor_token"].text()
+        numbers = [[one[key].value for key in _NUSCENES] for one in (entry, parts.get(name, entry))]
+        if numbers[0] != numbers[1]:
+            raise InputError("holds several calibrations of a camera; save the sensors of one recording")
+        parts[name] = entry
+    return parts
+
+
+NUSCENES = table(
+    CameraKeys("nuScenes", _NUSCENES[:1], (_NONE,)),
+    lambda document: re.match(r'\s*\[\s*\{[^}]*"sensor_token"', document.text[:5000]),
+    "calibrated_sensor.json of nuScenes, with the sensors of one recording",
+    parts=_nuscenes_parts,
+    pose=PoseKeys(_NUSCENES[1:], back=True, needed=True, frame="vehicle"),
+    most_cameras=99,
+    rig="`rotation, translation` from each camera to the vehicle",
 )
 
 # Middlebury and ETH3D: a rectified pair, whose second camera is at (baseline, 0, 0) of the first.

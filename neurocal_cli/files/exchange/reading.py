@@ -78,6 +78,8 @@ READ: tuple[Format, ...] = (
     sensors.DJI,
     datasets.KITTI,
     datasets.ARGOVERSE,
+    datasets.NUSCENES,
+    datasets.ZOD,
     datasets.MIDDLEBURY,
     datasets.MVSNET,
     datasets.KRTD,
