@@ -14,8 +14,9 @@ HEAD = "| cause | what the data look like | shared by | advice |\n| --- | --- | 
 
 
 def table() -> str:
-    """One row for each cause, and for each of its looks."""
+    """One row for each cause of a camera and of a rig, and for each of its looks."""
     sys.path[:0] = [str(ROOT)]
+    from neurocal_cli.calibration.rig.causes import CAUSES
     from neurocal_cli.calibration.verdict import effects
     from neurocal_cli.calibration.verdict.rivals import RIVALS
 
@@ -26,10 +27,10 @@ def table() -> str:
         effects.grouped: "a group of views",
         None: "no views: each has its own",
     }
-    rows = dict.fromkeys(
-        f"| {one.cause} | {one.looks} | {shared[one.patterns]} | {one.advice} |\n" for one in RIVALS
-    )
-    return HEAD + "".join(rows)
+    rows = [(one, shared[one.patterns]) for one in RIVALS]
+    rows += [(one, f"{'all cameras' if one.of_all else 'a camera'} of a rig") for one in CAUSES]
+    told = dict.fromkeys(f"| {one.cause} | {one.looks} | {who} | {one.advice} |\n" for one, who in rows)
+    return HEAD + "".join(told)
 
 
 def main() -> None:

@@ -37,6 +37,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Finding,
     Limit,
     name_some,
+    or_else,
     verdict_of,
 )
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -276,7 +277,7 @@ def _frames(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if e.cause is not None:
         yield (
             max(1, _SCATTER.grade(e.scatter), CONTRADICTION.grade(e.growth), e.cause.grade),
-            e.cause.text,
+            e.cause.text + or_else(e.cause.others),
             e.cause.advice,
         )
         return

@@ -1,87 +1,63 @@
-"""Causes that make the frames of a rig contradict each other, and the one rule by which they are compared.
+"""Causes that make the frames of a rig contradict each other.
 
-Each cause moves what one camera or all see by a few unknowns: the pose of the views, or the focal length. At
-the minimum of the common fit the gain of each follows from small matrices, with all cameras and the poses of
-all frames eliminated. What the common fit leaves beyond the cameras alone is a chi-squared variable of d
-degrees of freedom if the rig is sound. The log evidence of a cause with m unknowns and a number of choices is
-
-    d/2 log(s^2 / s_m^2) - m/2 log d - log choices,
-
-with s^2 and s_m^2 the squares over their degrees of freedom without and with it, but at least 1.
+Each moves what one camera or all see by a few unknowns: the pose of the views, or the focal length. They are
+compared as the causes of a camera are (`verdict.rival`), with all cameras and the poses of all frames
+eliminated, by what the common fit leaves beyond the cameras alone. Of these residuals, six of each view but
+the first of a frame, the least noise is known: that of the cameras alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import Arrowhead, solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.problem import Motion, RigProblem
+from neurocal_cli.calibration.verdict.effects import step
 from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, Limit, in_sequence
+from neurocal_cli.calibration.verdict.rival import ABSORBED, Cause, Found, Known, Pattern, Said, Unknowns
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 
-_LEAST_FRAMES = 2  # of each part before and after a change
-
-# Least share of what exceeds chance that a named cause explains, and the same where the target's motion
-# between frames, which is known roughly, belongs to the fit.
-_OF_MOTION = 0.8
-
 _FREE = np.array([0, 2, *POSE_COLUMNS])  # alpha_u, alpha_v and the pose of a view in its camera
-
-_ROUNDING = 1e-14
-
-
+_FEWEST = 3  # frames that show no change
 _OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they are equal
 
 
 @frozen_dataclass(eq=False)
-class RigCause:
-    """A cause that moves what one camera sees, or all cameras."""
-
-    cause: str
-    advice: str
-    say: Callable[[Named], str]
-    is_change: bool  # from some frame on, or all the time
-    limit: Limit  # of its amount
-    # (V_c, 8, m): how alpha_u, alpha_v and the pose (omega, tau) of each view change with its m unknowns.
-    steps: Callable[[RigFit, int, Motion | None], Array]
-    of_all: bool = False  # all cameras together, or one of them
-    # Whether it is one of two cameras against the other, so that either has it: then the second one.
-    is_mutual: bool = True
-    cost: int = 0  # number of unknowns that it counts as, if it is not its own
-
-
-@frozen_dataclass(eq=False)
 class Named:
-    """A cause that a camera has, or all have, and what the residuals say about it."""
+    """A cause that a camera has, or all have."""
 
-    cause: RigCause
+    found: Found[RigCause]
+    others: tuple[str, ...]  # causes that are hardly less probable
     cameras: tuple[str, ...]  # of the rig, the first one is that whose frame it has
     side: int  # of the camera that has the cause; -1 for all
-    evidence: float  # log odds over nothing
-    explained: float  # share of what exceeds chance
-    amounts: Array  # (m,) of its unknowns
-    last: str  # frame before the change, and the first after it; "" if it is no change
-    first: str
+    between: str  # the frames between which something changed; "" if it is no change
     size: float  # typical size of the targets after a change over that before, 1 if it is no change
     is_late: bool  # whether the smaller part of the frames is that after the change
     apart: tuple[NDArray[np.bool_], ...]  # (V_c,) of each camera, its views that show it in the smaller part
 
     @property
+    def cause(self) -> RigCause:
+        """Which one it is."""
+        return self.found.rival
+
+    @property
     def amount(self) -> float:
-        """The mean of its unknowns."""
-        return float(self.amounts.mean())
+        """Its first unknown."""
+        return float(self.found.amounts[0])
 
     @property
     def grade(self) -> int:
         """What its amount means for the rig."""
-        return self.cause.limit.grade(abs(self.amount))
+        return self.cause.limit.grade(self.cause.say(self)[1])
 
     @property
     def mixes_units(self) -> bool:
@@ -93,7 +69,7 @@ class Named:
         """What is wrong."""
         if self.mixes_units:
             return f"the targets became {self.size:.3g} times as large, by their X,Y,Z, {self.between}"
-        return self.cause.say(self)
+        return self.cause.say(self)[0]
 
     @property
     def advice(self) -> str:
@@ -103,15 +79,22 @@ class Named:
         )
 
     @property
-    def between(self) -> str:
-        """The frames between which something changed."""
-        return f"between {self.last} and {self.first}"
-
-    @property
     def camera(self) -> str:
         """The camera that has it, as words."""
         name = self.cameras[self.side]
         return f"the {name} camera" if name in ("left", "right") else f"camera {name}"
+
+
+@frozen_dataclass(eq=False)
+class RigCause(Cause[Named]):
+    """A cause that moves what one camera sees, or all cameras."""
+
+    is_change: bool  # from some frame on, or all the time
+    # (V_c, 8, m): how alpha_u, alpha_v and the pose (omega, tau) of each view change with its m unknowns.
+    steps: Callable[[RigFit, int, Motion | None], Array]
+    of_all: bool = False  # all cameras together, or one of them
+    # Whether it is one of two cameras against the other, so that either has it: then the second one.
+    is_mutual: bool = True
 
 
 def _pose(fit: RigFit, side: int, motion: Motion | None) -> Array:
@@ -148,29 +131,25 @@ def _delay(fit: RigFit, side: int, motion: Motion | None) -> Array:
     return steps
 
 
-def _percent(found: Named) -> str:
-    return f"{100 * found.amount:+.2g} %"
+def _has_moved(found: Named) -> Said:
+    who = "the rig" if len(found.cameras) == 2 else found.camera
+    return f"{who} moved {found.between}", np.inf
 
 
-def _has_moved(found: Named) -> str:
-    if len(found.cameras) == 2:
-        return f"the rig moved {found.between}"
-    return f"{found.camera} moved {found.between}"
-
-
-def _is_late(found: Named) -> str:
+def _is_late(found: Named) -> Said:
     when = "later" if found.amount > 0 else "earlier"
     others = "others" if len(found.cameras) > 2 else "other"
     return (
         f"the images of a frame were not taken at the same moment: those of {found.camera} were taken {when} "
-        f"than those of the {others}, by {abs(found.amount):.2g} of the time between frames"
+        f"than those of the {others}, by {abs(found.amount):.2g} of the time between frames",
+        abs(found.amount),
     )
 
 
-def _has_zoomed(found: Named) -> str:
-    if found.side < 0:
-        return f"the focal lengths of all cameras changed by {_percent(found)} {found.between}"
-    return f"the focal length of {found.camera} changed by {_percent(found)} {found.between}"
+def _has_zoomed(found: Named) -> Said:
+    whose = "lengths of all cameras" if found.side < 0 else f"length of {found.camera}"
+    by = f"{100 * found.amount:+.2g} %"
+    return f"the focal {whose} changed by {by} {found.between}", abs(found.amount)
 
 
 def _larger(found: Named) -> str:
@@ -179,18 +158,20 @@ def _larger(found: Named) -> str:
     return f"{100 * abs(larger):.2g} % {'larger' if larger > 0 else 'smaller'}"
 
 
-def _has_another_target(found: Named) -> str:
+def _has_another_target(found: Named) -> Said:
     return (
         f"the target of {found.camera} is {_larger(found)} than its X,Y,Z say, compared with that of "
-        f"the other{'s' * (len(found.cameras) > 2)}"
+        f"the other{'s' * (len(found.cameras) > 2)}",
+        abs(found.amount),
     )
 
 
-def _has_another_size(found: Named) -> str:
+def _has_another_size(found: Named) -> Said:
     return (
         f"the size of the target changed {found.between}: it is {_larger(found)} than before, compared with "
         "X,Y,Z, as only the distances of the cameras differ (or they slid apart, or all changed their focal "
-        "length)"
+        "length)",
+        abs(found.amount),
     )
 
 
@@ -201,38 +182,43 @@ SAME_MOMENT = "trigger all cameras at the same moment, or hold the target still"
 """Advice where images of a frame were taken at different moments."""
 _LOCK = "calibrate each part by itself, and lock zoom and focus"
 _UNIT = "check the unit of X,Y,Z and the size of the squares in this camera's points"
-_MATTERS, _ZOOMED = Limit(0.0, 0.01), Limit(0.0, 0.005)  # of relative sizes
-MOVED_CAMERA = RigCause("a camera moved", EACH_PART, _has_moved, True, Limit(0.0, np.inf), _pose)
+_ANY, _MATTERS, _ZOOMED = Limit(0.0, np.inf), Limit(0.0, 0.01), Limit(0.0, 0.005)  # of relative sizes
+MOVED_CAMERA = RigCause(
+    "a camera that moved", "from some frame on, its pose in the rig is another one", EACH_PART, _has_moved,
+    _ANY, True, _pose,
+)  # fmt: skip
 LATE_CAMERA = RigCause(
-    "a camera's images were taken later", SAME_MOMENT, _is_late, False, Limit(0.0, np.inf), _delay
-)
+    "a camera whose images are late", "its views show the target further on its way from frame to frame",
+    SAME_MOMENT, _is_late, _ANY, False, _delay,
+)  # fmt: skip
 OTHER_SIZE = RigCause(
-    "the target has another size from some frame on", _SQUARES, _has_another_size, True, _MATTERS, _size,
-    of_all=True,
+    "a target of another size from some frame on", "all targets are nearer, or all farther away", _SQUARES,
+    _has_another_size, _MATTERS, True, _size, of_all=True,
 )  # fmt: skip
 CAUSES = (
     MOVED_CAMERA,
     LATE_CAMERA,
     OTHER_SIZE,
-    RigCause("a camera's focal length changed", _LOCK, _has_zoomed, True, _ZOOMED, _focal, is_mutual=False),
-    # All focal lengths together mimic small turns of the cameras.
     RigCause(
-        "all cameras' focal lengths changed", _LOCK, _has_zoomed, True, _ZOOMED, _focal, of_all=True, cost=6
+        "a camera that was refocused", "from some frame on, it has another focal length", _LOCK, _has_zoomed,
+        _ZOOMED, True, _focal, is_mutual=False,
     ),
-    RigCause("one camera's target has another size", _UNIT, _has_another_target, False, _MATTERS, _size),
-)
+    RigCause(
+        "cameras that were refocused", "from some frame on, all have another focal length", _LOCK,
+        _has_zoomed, _ZOOMED, True, _focal, of_all=True,
+    ),
+    RigCause(
+        "another target before one camera", "its targets are nearer, or farther away, than the others say",
+        _UNIT, _has_another_target, _MATTERS, False, _size,
+    ),
+)  # fmt: skip
 TAKEN = "taken"
 """First word of the reason for views that were taken before or after the rig changed."""
 TWO_GEOMETRIES = (MOVED_CAMERA, OTHER_SIZE)
 """Causes after which one part of the frames determines the rig."""
 
 
-def log_evidence(before: float, after: float, degrees: int, m: int) -> float:
-    """Log odds of m unknowns that lower the squares from one value to another."""
-    without, with_them = max(before / degrees, 1.0), max(after / max(degrees - m, 1), 1.0)
-    return float(0.5 * degrees * np.log(without / with_them) - 0.5 * m * np.log(degrees))
-
-
+@quietly
 def named_cause(
     fit: RigFit,
     names: Sequence[str],
@@ -244,125 +230,138 @@ def named_cause(
     `free` (n_shared,) are the shared unknowns that may move with a cause, by default all that the points
     determine, also of cameras that the fit did not refine.
     """
-    free = fit.problem.estimated_shared if free is None else free
     squares, degrees = scatter(fit)
-    if not degrees:
-        return None, 0.0
-    rest = float(np.sqrt(squares / degrees))
+    rest = float(np.sqrt(squares / max(degrees, 1)))
     if not is_significant(squares, degrees):
         return None, rest
-    found = list(_ranked(fit, names, squares, degrees, causes, np.flatnonzero(free)))
-    best = max(found, key=lambda one: one.evidence, default=None)
-    least = EXPLAINED if fit.problem.motion is None else _OF_MOTION
-    if best is None or best.evidence < LEVEL or best.explained < least:
+    moving = np.flatnonzero(fit.problem.estimated_shared if free is None else free)
+    rivals = _Rivals(fit, moving, causes)
+    M, _ = rivals.arrow.reduced()
+    M[-1, -1] = squares
+    try:
+        known = Known.of(M, degrees, degrees)
+    except np.linalg.LinAlgError:
         return None, rest
-    return best, float(np.sqrt(max(1.0 - best.explained, 0.0) * max(squares / degrees - 1.0, 0.0) + 1.0))
+    if ranking := rivals.ranking(known):
+        known = replace(known, n=degrees * rivals.independent(*ranking[0]))
+        ranking = rivals.ranking(known)
+    # Of those that are hardly less probable than the first, that which is the first in the list.
+    close = [one for one in ranking if one[0].evidence >= ranking[0][0].evidence - LEVEL]
+    found, subject = min(close, key=lambda one: causes.index(one[0].rival), default=(None, 0))
+    if found is None or found.explained < EXPLAINED * (1.0 - degrees / known.cost):
+        return None, rest
+    others = dict.fromkeys(one.rival.cause for one, _ in close if one.rival is not found.rival)
+    named = _named(fit.problem, tuple(names), tuple(others), found, subject)
+    return named, float(np.sqrt((1.0 - found.explained) * known.cost / degrees))
 
 
-def _ranked(
-    fit: RigFit,
-    names: Sequence[str],
-    squares: float,
-    degrees: int,
-    causes: Sequence[RigCause],
-    free: NDArray[np.intp],
-) -> Iterator[Named]:
-    problem, motion = fit.problem, motion_of(fit.problem, fit.state, None)
-    arrow = fit.normal.only(free)
-    reduced, _ = arrow.reduced()
-    S, g = reduced[:-1, :-1], reduced[:-1, -1]
-    inverse = solve_scaled(S, np.eye(len(S)))
-    step = inverse @ g
-    squares = max(squares - float(g @ step), 0.0)
-    sides = range(len(names))
-    seen = [seen_by(fit, side, free) for side in sides]
-    for cause in causes:
-        for subject in _subjects(cause, len(names)):
-            members = sides if subject < 0 else (subject,)
-            Z = [cause.steps(fit, side, motion) for side in members]
-            if not any(part.any() for part in Z):
-                continue
-            frames, labels = _frames_of(problem, members)
-            A, X, r = along(arrow, frames, [seen[side] for side in members], Z)
-            A, X, r = (_sums(part, cause.is_change, not len(free)) for part in (A, X, r))
-            if not len(A):
-                continue
-            left = A - X @ inverse @ np.swapaxes(X, 1, 2)
-            right = r - X @ step
-            values = solve_scaled(left, right[..., None], _ROUNDING)[..., 0]
-            gains = np.nan_to_num((values * right).sum(axis=1))
-            k, m = int(np.argmax(gains)), cause.cost or values.shape[1]
-            gain = float(min(gains[k], squares))
-            choices = len(gains) * (1 if cause.of_all else len(names))
-            evidence = log_evidence(squares, squares - gain, degrees, m) - np.log(choices)
-            places = max(len(frames) - 2 * _LEAST_FRAMES + 1, 0)
-            at = k % places + _LEAST_FRAMES if cause.is_change else 0
-            found = values[k] if k < places or not cause.is_change else -values[k]
-            is_late = 2 * at > len(frames)
-            smaller = np.zeros(len(problem.scale), dtype=bool)
-            smaller[frames[at:] if is_late else frames[:at]] = True
-            size = 1.0
-            if cause.is_change:
-                size = float(median(problem.scale[frames[at:]]) / median(problem.scale[frames[:at]]))
-            either = cause.of_all or len(names) == 2
-            apart = tuple(
-                smaller[observed.view] & (either or side == subject)
-                for side, observed in enumerate(problem.observations)
-            )
-            ends = (labels[at - 1], labels[at]) if cause.is_change else ("", "")
-            explained = min(gain / max(squares - degrees, 1e-300), 1.0)
-            yield Named(
-                cause,
-                tuple(names),
-                subject,
-                float(evidence),
-                float(explained),
-                found,
-                *ends,
-                size,
-                is_late,
-                apart,
-            )
+class _Rivals:
+    """The causes that are possible in a rig, with some free shared unknowns (f,)."""
+
+    def __init__(self, fit: RigFit, free: NDArray[np.intp], causes: Sequence[RigCause]) -> None:
+        C = len(fit.problem.names)
+        self.fit, self.arrow, self.is_held = fit, fit.normal.only(free), not len(free)
+        self.seen = [seen_by(fit, side, free) for side in range(C)]
+        self.motion = motion_of(fit.problem, fit.state, None)
+        self.unknowns: list[tuple[Unknowns[RigCause], int]] = []  # and the camera that has them, -1 for all
+        for cause in causes:
+            for subject in (-1,) if cause.of_all else (1,) if C == 2 and cause.is_mutual else range(C):
+                Z = self.steps(cause, subject)
+                if any(part.any() for part in Z.values()):
+                    its = along(self.arrow, _frames_of(fit.problem, subject)[0], self.seen, Z)
+                    self.unknowns.append((Unknowns(cause, *its), subject))
+
+    def steps(self, cause: RigCause, subject: int) -> dict[int, Array]:
+        """Of one camera or all, by their index."""
+        sides = range(len(self.seen)) if subject < 0 else (subject,)
+        return {side: cause.steps(self.fit, side, self.motion) for side in sides}
+
+    def ranking(self, known: Known) -> list[tuple[Found[RigCause], int]]:
+        """Those that are more than chance, and their cameras, the most probable one first."""
+        found = [
+            (one, subject)
+            for its, subject in self.unknowns
+            for one in its.shared(known, self._patterns(its), LEVEL)
+            if one.evidence > LEVEL
+        ]
+        return sorted(found, key=lambda one: -one[0].evidence)
+
+    def _patterns(self, its: Unknowns[RigCause]) -> Iterator[Pattern]:
+        """All frames, or those from one on; if the rig is held, either part may be that which changed."""
+        n, choices = len(its.S), 1.0 if its.rival.of_all else float(len(self.seen))
+        if not its.rival.is_change:
+            yield "all", np.ones((1, n)), choices
+        elif n > _FEWEST:
+            name, weights, places = step(np.arange(n))
+            if self.is_held:
+                weights, places = np.concatenate([weights, 1.0 - weights]), 2 * places
+            yield name, weights, places * choices
+
+    def independent(self, found: Found[RigCause], subject: int) -> float:
+        """Share of the degrees of freedom that are independent, by what the cause leaves in each view.
+
+        A sum of squares varies the more, the fewer of them it is made of (Satterthwaite). A cause beyond the
+        linear range leaves much in few views, so what is there without it counts as well.
+        """
+        problem, squares = self.fit.problem, []
+        weights = np.zeros(len(problem.scale))
+        weights[_frames_of(problem, subject)[0]] = found.weights
+        its = self.steps(found.rival, subject)
+        for side in its:
+            frames = _frames_of(problem, side)[0]
+            moves = {k: (k == side) * _pose(self.fit, k, None) for k in its}
+            both = {k: np.concatenate([moves[k], Z], axis=2) for k, Z in its.items()}
+            S, X, _ = along(self.arrow, frames, self.seen, both)
+            S, X, by_cause = S[:, :6, :6], X[:, :6], S[:, :6, 6:] @ found.amounts
+            step = X[:, :, :-1] @ found.camera + weights[frames, None] * by_cause
+            left = np.stack([X[:, :, -1], X[:, :, -1] - step], axis=2)
+            squares.append((left * solve_scaled(S, left)).sum(axis=1))
+        of_views = np.concatenate(squares)
+        share = 2 * of_views.mean(axis=0) ** 2 / of_views.var(axis=0) / 6
+        return float(np.minimum(np.nan_to_num(share, nan=1.0), 1.0).max())
 
 
-def _subjects(cause: RigCause, n: int) -> Sequence[int]:
-    """The cameras that may have a cause, by index; -1 is all."""
-    if cause.of_all:
-        return (-1,)
-    return (1,) if n == 2 and cause.is_mutual else range(n)
+def _named(
+    problem: RigProblem,
+    names: tuple[str, ...],
+    others: tuple[str, ...],
+    found: Found[RigCause],
+    subject: int,
+) -> Named:
+    frames, labels = _frames_of(problem, subject)
+    at, scale = int(np.argmax(found.weights != found.weights[0])), problem.scale[frames]
+    if at and found.weights[0] > 0:  # the part before it has the opposite
+        found = replace(found, amounts=-found.amounts)
+    is_late = 2 * at > len(frames)
+    smaller = np.zeros(len(problem.scale), dtype=bool)
+    smaller[frames[at:] if is_late else frames[:at]] = True
+    either = found.rival.of_all or len(names) == 2
+    return Named(
+        found,
+        others,
+        names,
+        subject,
+        f"between {labels[at - 1]} and {labels[at]}" if at else "",
+        float(median(scale[at:]) / median(scale[:at])) if at else 1.0,
+        is_late,
+        tuple(
+            smaller[observed.view] & (either or side == subject)
+            for side, observed in enumerate(problem.observations)
+        ),
+    )
 
 
-def _frames_of(problem: RigProblem, members: Sequence[int]) -> tuple[NDArray[np.intp], list[str]]:
-    """The frames of the rig that some cameras saw, in the order of their names, and words for them."""
+def _frames_of(problem: RigProblem, subject: int) -> tuple[NDArray[np.intp], list[str]]:
+    """The frames of the rig that a camera, or any, saw, in the order of their names, and words for them."""
+    of_two = len(problem.names) == 2  # of two cameras a frame is the pair of their views
     views: dict[int, list[str]] = {}
-    for side in members:
+    for side in range(len(problem.names)) if subject < 0 or of_two else (subject,):
         for name, frame in zip(problem.names[side], problem.observations[side].view.tolist(), strict=True):
             if problem.together[frame]:
                 views.setdefault(frame, []).append(name)
-    places = list(views)
-    # Of two cameras a frame is the pair of their views.
-    if len(problem.names) == 2:
-        for side in (0, 1):
-            for name, frame in zip(
-                problem.names[side], problem.observations[side].view.tolist(), strict=True
-            ):
-                if frame in views and name not in views[frame]:
-                    views[frame].insert(side, name)
-    order = in_sequence(tuple(views[place][0] for place in places))
-    labels = ["/".join(views[places[k]][: 2 if len(problem.names) == 2 else 1]) for k in order]
-    return np.array(places, dtype=np.intp)[order], labels
-
-
-def _sums(of_frames: Array, is_change: bool, either: bool) -> Array:
-    """Sums over all frames (1, ...), or over those from each place of a change on.
-
-    If the rig stays as it is, `either` part may be that which changed: then those before each place as well.
-    """
-    total = of_frames.sum(axis=0, keepdims=True)
-    if not is_change:
-        return np.asarray(total)
-    after = np.cumsum(of_frames[::-1], axis=0)[::-1][_LEAST_FRAMES : len(of_frames) - _LEAST_FRAMES + 1]
-    return np.concatenate([after, total - after]) if either else np.asarray(after)
+    frames = np.array(list(views), dtype=np.intp)
+    order = in_sequence(tuple(names[0] for names in views.values()))
+    return frames[order], ["/".join(views[k][: 1 + of_two]) for k in frames[order].tolist()]
 
 
 @frozen_dataclass(eq=False)
@@ -372,8 +371,7 @@ class SeenBy:
     frame: NDArray[np.intp]  # (V_c,)
     own: Array  # (V_c, 8, 8)
     by_frame: Array  # (V_c, 6, 8) coupling to the pose of the frame
-    by_shared: Array  # (V_c, 8, f) and to the free shared unknowns
-    right: Array  # (V_c, 8)
+    by_shared: Array  # (V_c, 8, f + 1) and to the free shared unknowns, and right side
 
 
 def seen_by(fit: RigFit, side: int, free: NDArray[np.intp]) -> SeenBy:
@@ -382,7 +380,8 @@ def seen_by(fit: RigFit, side: int, free: NDArray[np.intp]) -> SeenBy:
     observed = problem.observations[side]
     N = observed.weight * normal_blocks(observed.batches, problem.camera(state, side))[0]
     of_rig, by_rig, by_pose = problem.pose_steps(state, side)
-    shared = np.zeros((len(N), 8, len(fit.free)))
+    shared = np.zeros((len(N), 8, len(fit.free) + 1))
+    shared[:, :, -1] = N[:, _FREE, -1]
     shared[:, :, state.columns.cameras[side]] = N[
         :, _FREE[:, None], camera_columns(len(state.cameras[side].k))
     ]
@@ -391,35 +390,29 @@ def seen_by(fit: RigFit, side: int, free: NDArray[np.intp]) -> SeenBy:
         observed.view,
         N[:, _FREE[:, None], _FREE],
         np.swapaxes(by_pose, 1, 2) @ N[:, POSE_COLUMNS[:, None], _FREE],
-        shared[:, :, free],
-        N[:, _FREE, -1],
+        shared[:, :, np.append(free, -1)],
     )
 
 
 def along(
-    arrow: Arrowhead, frames: NDArray[np.intp], seen: Sequence[SeenBy], Z: Sequence[Array]
+    arrow: Arrowhead, frames: NDArray[np.intp], seen: Sequence[SeenBy], Z: Mapping[int, Array]
 ) -> tuple[Array, Array, Array]:
     """What some frames say about the unknowns of a cause, with the poses of the frames eliminated.
 
-    The information (F, m, m), the coupling to the free shared unknowns (F, m, f), the right sides (F, m).
+    `Z` are the steps of some cameras, by their index. The information (F, m, m), the coupling to the free
+    shared unknowns and the right sides (F, m, f + 1), and how much of the information is rounding (F, m).
     """
     place = np.full(len(arrow.own), -1)
     place[frames] = np.arange(len(frames))
-    m, f = Z[0].shape[2], seen[0].by_shared.shape[2]
-    A, a = np.zeros((len(frames), m, m)), np.zeros((len(frames), 6, m))
-    X, r = np.zeros((len(frames), m, f)), np.zeros((len(frames), m))
-    for one, steps in zip(seen, Z, strict=True):
+    m, f = next(iter(Z.values())).shape[2], seen[0].by_shared.shape[2]
+    A, a, X = np.zeros((len(frames), m, m)), np.zeros((len(frames), 6, m)), np.zeros((len(frames), m, f))
+    for side, steps in Z.items():
+        one = seen[side]
         inside = place[one.frame] >= 0
         rows, steps = place[one.frame[inside]], steps[inside]
         back = np.swapaxes(steps, 1, 2)
         A[rows] += back @ one.own[inside] @ steps
         a[rows] += one.by_frame[inside] @ steps
         X[rows] += back @ one.by_shared[inside]
-        r[rows] += (back @ one.right[inside][..., None])[..., 0]
     back = np.swapaxes(solve_scaled(arrow.own[frames], a), 1, 2)
-    cross = arrow.cross[frames]
-    return (
-        A - back @ a,
-        X - back @ cross[:, :, :-1],
-        r - (back @ cross[:, :, -1:])[..., 0],
-    )
+    return A - back @ a, X - back @ arrow.cross[frames], ABSORBED * np.diagonal(A, axis1=1, axis2=2)

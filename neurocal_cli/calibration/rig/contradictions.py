@@ -22,7 +22,6 @@ from neurocal_cli.calibration.rig.causes import (
     TAKEN,
     TWO_GEOMETRIES,
     Named,
-    log_evidence,
     named_cause,
 )
 from neurocal_cli.calibration.rig.consensus import UNSYNCHRONISED
@@ -191,12 +190,18 @@ def is_common(found: Named, still: RigFit, fit: RigFit, n: int) -> bool:
     second geometry is that of the fits of both parts.
     """
     squares, degrees = scatter(still)
-    rest, evidence = scatter(fit)[0], found.evidence
+    rest, evidence = scatter(fit)[0], found.found.evidence
     if found.cause in TWO_GEOMETRIES:
         own = scatter(_by_itself(still.problem, fit, found))[0]
         choices = float(np.log(still.problem.together.sum() * len(still.problem.cameras)))
         evidence = log_evidence(squares, rest + own, degrees, int(of_rig(still).sum())) - choices
     return evidence > log_evidence(squares, rest, degrees, 6 * n)
+
+
+def log_evidence(before: float, after: float, degrees: int, m: int) -> float:
+    """Log odds of m unknowns that were fitted, and lower the squares from one value to another."""
+    without, with_them = max(before / degrees, 1.0), max(after / max(degrees - m, 1), 1.0)
+    return float(0.5 * degrees * np.log(without / with_them) - 0.5 * m * np.log(degrees))
 
 
 def seen_again(problem: RigProblem, fit: RigFit, found: Named) -> Named:
@@ -237,9 +242,9 @@ def _moved_or_larger(problem: RigProblem, fit: RigFit, found: Named) -> Named:
     scale = float(along @ information @ step / (along @ information @ along))
     rest = step - scale * along
     if not float(rest @ information @ rest) < 5 * np.log(max(scatter(at_fit(problem, fit))[1], 2)):
-        return replace(found, cause=MOVED_CAMERA, side=1)
-    longer = scale if found.is_late else 1 / (1 + scale) - 1
-    return replace(found, cause=OTHER_SIZE, side=-1, amounts=np.array([longer]))
+        return replace(found, found=replace(found.found, rival=MOVED_CAMERA), side=1)
+    longer = np.array([scale if found.is_late else 1 / (1 + scale) - 1])
+    return replace(found, found=replace(found.found, rival=OTHER_SIZE, amounts=longer), side=-1)
 
 
 def _covariance(fit: RigFit) -> Array:

@@ -97,8 +97,7 @@ def relative_poses(problem: RigProblem, rig: Pose) -> RelativePoses | None:
     shared = np.flatnonzero(free)
     arrow = fit.normal.only(shared)
     steps = MOVED_CAMERA.steps(fit, 1, None)
-    A, X, r = along(arrow, problem.paired, [seen_by(fit, 1, shared)], [steps])
-    bordered = np.concatenate([X, r[..., None]], axis=2)
+    A, bordered, _ = along(arrow, problem.paired, [seen_by(fit, 1, shared)], {0: steps})
     solved = solve_scaled(A, np.concatenate([bordered, np.broadcast_to(np.eye(6), A.shape)], axis=2))
     if not np.isfinite(solved).all():
         return None

@@ -24,6 +24,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Finding,
     Limit,
     image_diagonal,
+    or_else,
 )
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
@@ -310,9 +311,7 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
             # The standard deviations do not include the board and the lens.
             grade = max(grade, int(not found.rival.of_given))
-        if names:
-            reason += f" (or, hardly less probable: {', '.join(names)})"
-        yield grade, reason, found.rival.advice
+        yield grade, reason + or_else(names), found.rival.advice
 
 
 def given_camera(contest: Contest | None, calibration: Calibration) -> list[Finding]:

@@ -188,9 +188,15 @@ def grouped(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
     V, place = lin.views.n_views, _places(lin)
     if V < _FEWEST:
         return
-    yield "step", (place >= np.arange(2, V - 1)[:, None]).astype(float), V - 3.0
+    yield step(place)
     yield "groups", (place % 2 == 1).astype(float), 1.0
     yield "groups", _two_groups(S, g, lin.R[:, -1, -1]), float(2.0 ** min(V - 1, 1000))
+
+
+def step(place: NDArray[np.intp]) -> Pattern:
+    """From a place of the sequence on; two views or more are before it, and two after it."""
+    places = np.arange(2, len(place) - 1)
+    return "step", (place >= places[:, None]).astype(float), float(len(places))
 
 
 def _places(lin: Linearised) -> NDArray[np.intp]:

@@ -104,6 +104,12 @@ def name_some(names: Iterable[object]) -> str:
     return ", ".join(some[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
+def or_else(causes: Iterable[str]) -> str:
+    """What is added to a cause that others are hardly less probable than."""
+    told = ", ".join(causes)
+    return f" (or, hardly less probable: {told})" if told else ""
+
+
 def in_sequence(names: tuple[str, ...]) -> list[int]:
     """Indices that sort names of views in natural order, in which img2 comes before img10."""
     return list(_sequence(names))

@@ -3,13 +3,15 @@
 A rival adds a few unknowns. Its evidence is the logarithm of the probability of the data with it over that
 without it: poses, camera and its unknowns are integrated out, the noise is what it leaves, the size of its
 unknowns is the most probable one of a grid, and the logarithm of the number of choices among rivals of the
-same kind is taken off. Clean data hardly ever give more than `findings.LEVEL`.
+same kind is taken off. Clean data hardly ever give more than `findings.LEVEL`. The rivals of a rig
+(`rig.causes`) are compared by the same rule.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -23,21 +25,24 @@ from neurocal_cli.camera.geometry import Array
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
 _NO_COST, _ROUNDING = 1e-12, 1e-9
 _ITERATIONS = 3  # the noise is what the rival leaves
-_ABSORBED = (
-    1e-7  # share of the information about an unknown, beside the poses, that is not more than rounding
-)
+ABSORBED = 1e-7
+"""Share of the information about an unknown, beside the poses, that is not more than rounding."""
 
 Steps = Callable[[Linearised], Array]
 Pattern = tuple[str, Array, float]
 """Name, weights (P, V) of the views at P places, and the number of choices among patterns of its kind."""
 Patterns = Callable[[Linearised, Array, Array], Iterator[Pattern]]
+Said = tuple[str, float]
+"""A reason, and the size that the rival's limit grades."""
+Its = TypeVar("Its")  # rival
+About = TypeVar("About")
 
 
 @frozen_dataclass(eq=False)
-class Estimate:
+class Found(Generic[Its]):
     """What the residuals say about a rival."""
 
-    rival: Rival
+    rival: Its
     pattern: str  # "" if each view has unknowns of its own
     evidence: float  # log odds over nothing
     explained: float  # share of the squared error
@@ -101,13 +106,22 @@ class Told:
         return float(np.sqrt(max(self.found.explained * self.lin.cost / n, 0.0))) * views.pixel_scale
 
 
-Said = tuple[str, float]
-"""A reason, and the size that the rival's limit grades."""
 Say = Callable[[Told], Said]
 
 
 @frozen_dataclass(eq=False)
-class Rival:
+class Cause(Generic[About]):
+    """What is said of a cause."""
+
+    cause: str  # its name
+    looks: str  # what the data look like that show it
+    advice: str
+    say: Callable[[About], Said]
+    limit: Limit
+
+
+@frozen_dataclass(eq=False)
+class Rival(Cause[Told]):
     """A cause that changes what the camera sees by a few unknowns.
 
     It has an effect, or `steps` (c, m): the changes of the linearised columns by its m unknowns, which have
@@ -115,11 +129,6 @@ class Rival:
     own.
     """
 
-    cause: str  # its name
-    looks: str  # what the data look like that show it
-    advice: str
-    say: Say
-    limit: Limit
     patterns: Patterns | None = None
     effect: Effect | None = None
     steps: Steps | None = None
@@ -136,6 +145,9 @@ class Rival:
         return np.eye(lin.width)[:, lin.columns[self.effect]]
 
 
+Estimate = Found[Rival]
+
+
 @quietly
 def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float = 0.0) -> list[Estimate]:
     """The rivals with their most probable patterns, the most probable rival first.
@@ -144,7 +156,7 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
     evidence are left out. Raises `numpy.linalg.LinAlgError` if the views do not determine the camera.
     """
     kept = np.append(lin.free, lin.width)
-    known = _Known.of(lin.R[:, kept[:, None], kept].sum(axis=0), n)
+    known = Known.of(lin.R[:, kept[:, None], kept].sum(axis=0), n)
     best: dict[str, Estimate] = {}
     for rival in rivals:
         steps = rival.steps_at(lin)
@@ -152,9 +164,10 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
             continue
         X = steps.T @ lin.R[:, :-1]  # (V, m, c + 1)
         S, along = X[:, :, :-1] @ steps, X[:, :, kept]
-        absorbed = _ABSORBED * lin.before @ steps[: lin.before.shape[1]] ** 2  # (V, m)
-        effect = _Effect(rival, lin, S, along, absorbed)
-        for one in (effect.own if rival.patterns is None else effect.shared)(known, least):
+        absorbed = ABSORBED * lin.before @ steps[: lin.before.shape[1]] ** 2  # (V, m)
+        its = Unknowns(rival, S, along, absorbed)
+        shared = rival.patterns and rival.patterns(lin, S, along[:, :, -1])
+        for one in its.own(known, least) if shared is None else its.shared(known, shared, least):
             if one.evidence > (best[rival.cause].evidence if rival.cause in best else -np.inf):
                 best[rival.cause] = one
     return sorted(best.values(), key=lambda one: -one.evidence)
@@ -184,7 +197,7 @@ def including(lin: Linearised, found: Estimate) -> Linearised:
 
 
 @frozen_dataclass(eq=False)
-class _Known:
+class Known:
     """The quadratic in the camera's free parameters, bordered by the right side and the cost."""
 
     M: Array  # (f + 1, f + 1)
@@ -192,13 +205,16 @@ class _Known:
     inverse: Array  # (f, f)
     right: Array  # (f,) the step to the minimum
     cost: float
+    least: float  # squared error that noise leaves at least
 
     @classmethod
-    def of(cls, M: Array, n: float) -> _Known:
+    def of(cls, M: Array, n: float, least: float = 0.0) -> Known:
+        """With what noise leaves at least, if that is known."""
         scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M)[:-1], NOTHING))
         inverse = scale[:, None] * np.linalg.inv(M[:-1, :-1] * np.outer(scale, scale)) * scale
         right = inverse @ M[:-1, -1]
-        return cls(M, n, inverse, right, float(M[-1, -1] - right @ M[:-1, -1]))
+        cost = float(M[-1, -1] - right @ M[:-1, -1])
+        return cls(M, n, inverse, right, cost, max(_NO_COST * cost, least))
 
     def evidence(self, left: Array, spread: Array) -> Array:
         """Log odds of what leaves this squared error, with the log determinant of its unknowns."""
@@ -207,16 +223,15 @@ class _Known:
 
 
 @frozen_dataclass(eq=False)
-class _Effect:
+class Unknowns(Generic[Its]):
     """A rival's unknowns, with the poses eliminated."""
 
-    rival: Rival
-    lin: Linearised
+    rival: Its
     S: Array  # (V, m, m) information of each view about them
     along: Array  # (V, m, f + 1) coupling to the free parameters, and right side
     absorbed: Array  # (V, m) information that is not more than rounding
 
-    def own(self, known: _Known, least: float) -> Iterator[Estimate]:
+    def own(self, known: Known, least: float) -> Iterator[Found[Its]]:
         """Each view with unknowns of its own."""
         V, m = self.S.shape[:2]
         values, vectors = np.linalg.eigh(self.S)
@@ -225,13 +240,13 @@ class _Effect:
         turned = np.where(told[..., None], vectors.swapaxes(1, 2) @ self.along, 0.0).reshape(V * m, -1)
         by_precision = least_by_precision(known.M, values, turned)
         freely, _ = by_precision(np.array([_ROUNDING * values.max(initial=NOTHING)]))
-        if not known.evidence(np.maximum(freely, _NO_COST * known.cost), np.zeros(1))[0] > least:
+        if not known.evidence(np.maximum(freely, known.least), np.zeros(1))[0] > least:
             return
         _, logdet = np.linalg.slogdet(known.M[:-1, :-1])
         left = np.full(len(_SIZES), known.cost)
         for _ in range(_ITERATIONS):
             cost, by_size = by_precision(left / known.n / _SIZES**2)
-            left = np.maximum(cost, _NO_COST * known.cost)
+            left = np.maximum(cost, known.least)
         evidence = known.evidence(left, by_size - logdet)
         best = int(np.argmax(evidence))
         noise = float(left[best]) / known.n
@@ -239,15 +254,14 @@ class _Effect:
         N = known.M - (turned.T / (values + precision)) @ turned
         camera = np.linalg.solve(N[:-1, :-1], N[:-1, -1])
         amounts = (turned[:, -1] - turned[:, :-1] @ camera) / (values + precision)
-        yield Estimate(
+        yield Found(
             self.rival, "", float(evidence[best]), 1.0 - float(left[best]) / known.cost,
             (vectors @ amounts.reshape(V, m, 1))[..., 0], np.zeros(0), camera, float(_SIZES[best]), noise,
         )  # fmt: skip
 
-    def shared(self, known: _Known, least: float) -> Iterator[Estimate]:
+    def shared(self, known: Known, patterns: Iterable[Pattern], least: float) -> Iterator[Found[Its]]:
         """The best place of each pattern in which the views share the unknowns."""
-        assert self.rival.patterns is not None
-        for name, weights, choices in self.rival.patterns(self.lin, self.S, self.along[:, :, -1]):
+        for name, weights, choices in patterns:
             weights = np.atleast_2d(weights)
             of_all = _weighted(weights, self.along)
             X, g = of_all[:, :, :-1], of_all[:, :, -1] - of_all[:, :, :-1] @ known.right
@@ -257,20 +271,20 @@ class _Effect:
             turned = np.where(told, (vectors.swapaxes(1, 2) @ g[..., None])[..., 0], 0.0)
             values = np.where(told, values, NOTHING)
             freely = known.cost - (turned**2 / values).sum(axis=1)
-            reach = known.evidence(np.maximum(freely, _NO_COST * known.cost), 2 * np.log(choices))
+            reach = known.evidence(np.maximum(freely, known.least), 2 * np.log(choices))
             if not reach.max() > least:
                 continue
             left = np.full((len(weights), len(_SIZES)), known.cost)
             for _ in range(_ITERATIONS):
                 precision = left / known.n / _SIZES**2
                 gained = (turned[:, None] ** 2 / (values[:, None] + precision[..., None])).sum(axis=2)
-                left = np.maximum(known.cost - gained, _NO_COST * known.cost)
+                left = np.maximum(known.cost - gained, known.least)
             spread = np.log1p(values[:, None] / precision[..., None]).sum(axis=2)
             evidence = known.evidence(left, spread + 2 * np.log(choices))
             p, k = np.unravel_index(int(np.argmax(evidence)), evidence.shape)
             amounts = vectors[p] @ (turned[p] / (values[p] + precision[p, k]))
             camera = known.right - known.inverse @ (X[p].T @ amounts)
-            yield Estimate(
+            yield Found(
                 self.rival, name, float(evidence[p, k]), 1.0 - float(left[p, k]) / known.cost, amounts,
                 weights[p], camera, float(_SIZES[k]), float(left[p, k]) / known.n,
             )  # fmt: skip
