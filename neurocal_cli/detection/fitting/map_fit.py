@@ -166,9 +166,9 @@ _TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
 # far above the noise come from an uneven board, which a polynomial must not follow, so the price is higher
 # then. Insensitive, like all constants here; test_fit_parts.py selects known models.
 _PRICE, _UNEVEN_PRICE = 2.25, 3.0
-# Most unknowns over the observations that determine the map, and with a single term of a lens: without it, a
-# small part of a board in a distorted image has up to five times the errors; more terms overfit.
-_MOST_UNKNOWNS, _MOST_WITH_ONE = 0.5, 0.8
+# Most unknowns over the observations that determine the map, if it has a polynomial, and if it is a lens
+# alone: without its terms, a small part of a board in a distorted image has up to twenty times the errors.
+_MOST_UNKNOWNS, _MOST_OF_LENS = 0.5, 0.92
 _FIRST_SHARE = 0.3  # share of that price which the first step must gain for the fit to continue
 _FUTILE = 2  # richer lens models, or polynomials, without gain, after which no more are tried
 _UNEVEN = 4.0  # ratio of residuals to noise above which polynomials are tried although no lens model gained
@@ -252,7 +252,7 @@ def select_map(
         if futile[degree > 0] >= _FUTILE:
             continue
         now = now.with_model(radial, degree)
-        most = _MOST_WITH_ONE if len(now.free) == _HOMOGRAPHY + 1 else _MOST_UNKNOWNS
+        most = _MOST_UNKNOWNS if degree else _MOST_OF_LENS
         if best is not None and len(now.free) + len(shift) > most * n_telling:
             break
         count = len(now.free)

@@ -57,6 +57,9 @@ FIRST, SECOND = 0, 2
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
 _NO_VARIANCE = 1e-12  # px^2, of fits that are not determined
 _RIDGE = 1e-6  # keeps the gradients of vertices without pixels finite
+# Standard deviations beyond which the tilt of a line is not that of the map, and squared correlation with the
+# offset from which it matters. It does not where the light of a board of equal squares is uneven.
+_OUTLIER, _TELLING = 4.0, 0.1
 _NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
 # Number of terms of the series for crossings with a cosine below each limit, and for all others;
 # test_fit_models.py compares them with a rendered cross.
@@ -113,9 +116,12 @@ def _with_tilts(fit: BatchFit, grid: Array, lines: tuple[Lines, Lines], mapped: 
     covariance, precision = fit.covariance, np.zeros_like(fit.information)
     for line, which, step in zip(lines, (FIRST, SECOND), 0.5 * np.eye(2), strict=True):
         tilt = which + 1
+        departure, own = fit.values[:, tilt], covariance[:, tilt, tilt]
         variance = mapped.map.tilt_variance(grid, step, line.normal) * mapped.excess
-        spread = excess_variance(fit.values[:, tilt], covariance[:, tilt, tilt] + variance)
-        precision[:, tilt, tilt] = 1 / (variance + spread + _NO_VARIANCE)
+        variance += excess_variance(departure, own + variance) + _NO_VARIANCE
+        agrees = departure**2 < _OUTLIER**2 * (own + variance)
+        tells = covariance[:, which, tilt] ** 2 > _TELLING * covariance[:, which, which] * own
+        precision[:, tilt, tilt] = (agrees & tells) / variance
     fit = replace(fit, information=fit.information + precision)
     back = fit.covariance @ (precision @ fit.values[:, :, None])
     return replace(fit, values=fit.values - back[:, :, 0])

@@ -93,7 +93,7 @@ def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Arr
     sigmas, offsets = _SIGMAS, _OFFSETS
     for _ in range(2):
         lines = raw.edges.lines(found.map)
-        values, offset = _profiles(raw, lines, gaps, sigmas, offsets)
+        values, offset = _profiles(raw, found.map, lines, gaps, sigmas, offsets)
         variance = np.full(len(offset), _OFFSET_SIGMA**2)
         observations = raw.observations(lines, offset, variance, np.ones((len(offset), 1)))
         found = fit_map(found.map, observations, found.shift)
@@ -125,7 +125,7 @@ def _crossing(at: SmoothMap, ink: Ink) -> tuple[Lines, Lines]:
 
 
 def _profiles(
-    raw: GridImage, lines: Lines, gaps: tuple[Array, Array], sigmas: Array, offsets: Array
+    raw: GridImage, at: SmoothMap, lines: Lines, gaps: tuple[Array, Array], sigmas: Array, offsets: Array
 ) -> tuple[Array, Array]:
     """Mean level, half contrast and blur (E, 3) of edges, and their offsets (E,) [px], by profiles across.
 
@@ -133,7 +133,11 @@ def _profiles(
     other colour than the cell in which it is.
     """
     share, side = gaps
-    gap, near = share * lines.width, share < 0.5
+    # In perspective, the marker's line is not at its share of the distance to the next line.
+    across = np.where(raw.edges.vertical[:, None], [1.0, 0.0], [0.0, 1.0])
+    inside = raw.edges.centre + (share * side * raw.edges.light)[:, None] * across
+    gap = np.abs(((at.at(inside) - lines.middle) * lines.normal).sum(axis=1))
+    near = share < 0.5
     room = np.minimum(np.where(near, 1.6 * gap, np.inf), 0.4 * lines.width)
     d = np.linspace(-1, 1, _PLACES) * room[:, None]
     image = np.asarray(raw.image, dtype=np.float32)
