@@ -50,9 +50,12 @@ _NODES = 48
 # the slope for the first guess of that radius: at first as for typical lenses, then hardly any slope.
 _LEAST = ((0.1, 1.02, 0.5), (0.02, 1.0, 1.0))
 _GUESS = 0.5  # slope with which a corner's radius is corrected
-_ROUNDS, _STEPS, _MORE_STEPS = 12, 60, 600
+ROUNDS = 12
+"""Most penalties that are tried, one after another."""
+_STEPS, _MORE_STEPS = 60, 600
 _CHANCE = 10.8  # chi-squared of one condition, exceeded in one case of a thousand
-_TIE = 0.009  # negligible relative increase of the rms error
+TIE = 0.009
+"""Negligible relative increase of the rms error."""
 
 
 @frozen_dataclass(eq=False)
@@ -142,7 +145,7 @@ def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted]
     views, cost = problem.views, float(found.cost.sum())
     effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
     # The image circle of a wide lens may end within the image, and its corners show nothing.
-    tie = 0.0 if found.state.distortion.wide else 2 * _TIE
+    tie = 0.0 if found.state.distortion.wide else 2 * TIE
     most = cost * (1 + max(tie, _CHANCE / effective))
     for least_slope in _LEAST:
         result = _with_slope(problem, found, most, least_slope)
@@ -155,16 +158,11 @@ def _with_slope(
     problem: Problem, found: Adjusted, most: float, least_slope: tuple[float, float, float]
 ) -> tuple[Problem, Adjusted] | None:
     """The best distortion with a least slope up to the corners; None if it costs more than `most`."""
-    least, beyond, guess = least_slope
-    weight = float(np.sqrt(found.cost.sum() / problem.views.n_equations)) / _SLACK
-    corner = beyond * _farthest(problem, found.state)
-    lens = found.state.distortion
-    adjusted, last = found, min(largest_angle(lens) if lens.wide else monotonic_radius(lens), corner)
-    last += max(corner - _distorted(found.state, last), 0.0) / guess
-    for _ in range(_ROUNDS):
-        if found.state.model == "fisheye":
-            last = min(last, np.pi / 2)
-        penalty = MonotonicFit(np.linspace(0, last, _NODES + 1)[1:], weight, least)
+    noise = float(np.sqrt(found.cost.sum() / problem.views.n_equations))
+    adjusted, penalty = found, None
+    for _ in range(ROUNDS):
+        A = problem.matrix(adjusted.state.entries[0])
+        penalty = next_penalty(adjusted.state, A, problem.points, noise, penalty, least_slope)
         penalised = replace(problem, penalty=penalty)
         adjusted = penalised.adjust(adjusted.state, _STEPS)
         state = adjusted.state
@@ -174,9 +172,33 @@ def _with_slope(
             # Along the edge of the penalty the descent is slow if several coefficients are involved.
             adjusted = adjusted if adjusted.converged else penalised.adjust(adjusted, _MORE_STEPS)
             return (penalised, adjusted) if adjusted.converged else None
-        corner = beyond * _farthest(problem, state)
-        last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
     return None
+
+
+def next_penalty(
+    state: CameraState,
+    A: Array,
+    points: Correspondences,
+    noise: float,
+    before: MonotonicFit | None = None,
+    least_slope: tuple[float, float, float] = _LEAST[-1],
+) -> MonotonicFit:
+    """The first penalty of a distortion that is not monotonic up to the corners, or one after another.
+
+    `noise` is the std of a residual. The penalty `before` led to this state, which is not monotonic yet.
+    """
+    least, beyond, guess = least_slope
+    corner = beyond * _farthest(A, points, state)
+    if before is None:
+        lens = state.distortion
+        last = min(largest_angle(lens) if lens.wide else monotonic_radius(lens), corner)
+        last += max(corner - _distorted(state, last), 0.0) / guess
+    else:
+        last = float(before.radii[-1])
+        last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
+    if state.model == "fisheye":
+        last = min(last, np.pi / 2)
+    return MonotonicFit(np.linspace(0, last, _NODES + 1)[1:], noise / _SLACK, least)
 
 
 def _distorted(state: CameraState, last: float) -> float:
@@ -187,10 +209,9 @@ def _distorted(state: CameraState, last: float) -> float:
     return float(distort(state.model, k, np.array([last]), np.zeros(1))[0][0])
 
 
-def _farthest(problem: Problem, state: CameraState) -> float:
+def _farthest(A: Array, points: Correspondences, state: CameraState) -> float:
     """Distance of the image's farthest corner in normalised image coordinates."""
-    A = problem.matrix(state.entries[0])
-    width, height = problem.points.image_size or (0, 0)
+    width, height = points.image_size or (0, 0)
     corners = np.array([[u, v, 1.0] for u in (0, width - 1) for v in (0, height - 1)])
     x, y, _ = np.linalg.solve(A, corners.T)
     if state.model == "tilted":

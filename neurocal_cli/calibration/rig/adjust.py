@@ -199,7 +199,7 @@ def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) ->
 
     def linearised(state: RigState) -> tuple[_Linearised, bool]:
         normal, sensible = problem.normal(state)
-        return (state, normal, normal.only(shared)), sensible
+        return (state, normal, problem.penalised(normal, state).only(shared)), sensible
 
     def moved(before: _Linearised, by_shared: Array, by_own: Array) -> tuple[_Linearised, bool]:
         # Valid if all points are in front of their cameras and the distortions are monotonic.

@@ -19,8 +19,8 @@ delay of each camera, which can be estimated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 from functools import cached_property
 from itertools import accumulate
 
@@ -35,6 +35,7 @@ from neurocal_cli.adjustment.reprojection import (
 )
 from neurocal_cli.adjustment.views import PointBatches
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
+from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, rotation_step
 from neurocal_cli.camera.pinhole import Pose
@@ -177,6 +178,8 @@ class RigProblem:
     extent: Array
     is_flat: NDArray[np.bool_]
     motion: Motion | None = None  # of the target, if the times of the views are known
+    # By camera, that which keeps its distortion monotonic up to the corners of its image.
+    penalties: Mapping[int, MonotonicFit] = field(default_factory=dict)
 
     @cached_property
     def together(self) -> NDArray[np.bool_]:
@@ -255,6 +258,7 @@ class RigProblem:
             cameras=tuple(self.cameras[side] for side in sides),
             own_normal=tuple(self.own_normal[side] for side in sides),
             motion=None,
+            penalties={},
         )
 
     def of_frames(self, frames: NDArray[np.intp]) -> RigProblem:
@@ -341,6 +345,17 @@ class RigProblem:
         found = self.blocks(state)
         views = self.view_equations(state, [blocks for blocks, _ in found])
         return self.gathered(views), all(bool(fine.all()) for _, fine in found)
+
+    def penalised(self, normal: Arrowhead, state: RigState) -> Arrowhead:
+        """The normal equations with the penalties, whose residuals are as large as whitened ones."""
+        shared = normal.shared.copy()
+        for side, penalty in self.penalties.items():
+            place = state.columns.cameras[side]
+            by_camera, missing = penalty(state.cameras[side])
+            rows = np.column_stack([by_camera, missing])
+            place = np.append(place, -1)
+            shared[place[:, None], place] += rows.T @ rows
+        return replace(normal, shared=shared)
 
     def blocks(self, state: RigState) -> list[tuple[Array, NDArray[np.bool_]]]:
         """`normal_blocks` of each camera."""

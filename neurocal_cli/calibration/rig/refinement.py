@@ -15,10 +15,11 @@ import numpy as np
 from neurocal_cli.adjustment.board.posterior import minimum_of
 from neurocal_cli.adjustment.board.prior import nearest_to_given, prior_of_target
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.lens_choice.monotonic_fit import ROUNDS, TIE, next_penalty
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, free_parameters, rig_problem
 from neurocal_cli.calibration.rig.covariance import information_of_rig
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
-from neurocal_cli.calibration.rig.result import non_monotonic_sides
+from neurocal_cli.calibration.rig.result import intrinsics_of, non_monotonic_sides
 from neurocal_cli.calibration.verdict.findings import CONTRADICTION
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.target import Target, scale_of_points
@@ -34,32 +35,48 @@ def adjusted(
 
     The cameras are not refined if errors of the rig would spoil them.
     """
-    moving = [refine_cameras] * len(problem.cameras)
+    cameras = [free_parameters(camera) & refine_cameras for camera in problem.calibrations]
+    free = np.concatenate([*cameras, np.ones(problem.n_rig, dtype=bool)])
+    fit = adjust_rig(problem, start, free)
+    # A larger rms residual, in units of that of the cameras alone, is of the frames, and would spoil the
+    # cameras: test_pairs_that_scatter_do_not_spoil_the_cameras.
+    if refine_cameras and np.sqrt(fit.variance) > CONTRADICTION.good:
+        free[: -problem.n_rig] = False
+        told = "the pairs of views contradict each other, so the cameras keep the result of their own views"
+        return adjust_rig(problem, start, free), [told]
+    found = _monotonic(fit)
     warnings = []
-    while True:
-        free = np.concatenate(
-            [free_parameters(c) & moves for c, moves in zip(problem.calibrations, moving, strict=True)]
-            + [np.ones(problem.n_rig, dtype=bool)]
-        )
-        fit = adjust_rig(problem, start, free)
-        # A larger rms residual, in units of that of the cameras alone, is of the frames, and would spoil the
-        # cameras: test_pairs_that_scatter_do_not_spoil_the_cameras.
-        if any(moving) and np.sqrt(fit.variance) > CONTRADICTION.good:
-            moving = [False] * len(moving)
-            warnings = [
-                "the pairs of views contradict each other, so the cameras keep the result of their own views"
-            ]
-            continue
-        if not (not_monotonic := non_monotonic_sides(fit)):
-            return fit, warnings
-        for side in not_monotonic:
-            moving[side] = False
+    for side in non_monotonic_sides(fit):
+        lens, camera = fit.state.cameras[side].distortion, problem.calibrations[side]
+        # The image circle of a wide lens may end within the image.
+        if not (lens.wide and found is fit) and not any("monotonic" in told for told in camera.warnings):
+            used = "it is used" if found is fit else "the best monotonic fit is used, which is a guess there"
             warnings.append(
-                f"after the common bundle adjustment the distortion model of the {names[side]} "
-                "is not monotonic (maps two directions to one pixel) inside the image, where there "
-                "are no points; the result of its own views is kept; add views that show the board in the "
-                "image's corners"
+                f"the distortion model {lens.model} of the {names[side]} that fits the points of all cameras "
+                "best is not monotonic (maps two directions to one pixel) in the image's corners, where "
+                f"there are no points; {used}; add views that show the board in the corners"
             )
+    return found, warnings
+
+
+def _monotonic(fit: RigFit) -> RigFit:
+    """The fit with monotonic distortions; as it is, if the data contradict these.
+
+    To hold a camera at the result of its own views instead would spoil the others.
+    """
+    found, noise = fit, float(np.sqrt(fit.variance))
+    for _ in range(ROUNDS):
+        if not (folded := non_monotonic_sides(found)):
+            return found
+        penalties = dict(found.problem.penalties)
+        for side in folded:
+            points = fit.problem.calibrations[side].points
+            lens, A = found.state.cameras[side], intrinsics_of(found, side).A
+            penalties[side] = next_penalty(lens, A, points, noise, penalties.get(side))
+        found = adjust_rig(replace(fit.problem, penalties=penalties), found.state, fit.free)
+        if found.cost > fit.cost * (1 + 2 * TIE):
+            break
+    return fit
 
 
 def with_board(fit: RigFit, target: Target, adjusted: Callable[[RigProblem, RigState], RigFit]) -> RigFit:
@@ -108,7 +125,7 @@ def _on_target(
     new = rig_problem(
         [on_it(camera) for camera in old.calibrations], [observed.view for observed in old.observations]
     )
-    new = replace(new, motion=old.motion)
+    new = replace(new, motion=old.motion, penalties=old.penalties)
     state = fit.state
     turned: Array = (state.view_R @ (new.centre - old.centre)[..., None])[..., 0]
     view_t = (state.view_t * old.scale[:, None] + turned) / new.scale[:, None]

@@ -121,7 +121,7 @@ class RigAssembly:
     def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
         """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
         given, observed = self.problem.calibrations[side], self.problem.observations[side]
-        intrinsics, batches = _intrinsics(self.fit, side), observed.batches
+        intrinsics, batches = intrinsics_of(self.fit, side), observed.batches
         alone = [camera.stop_reason for camera in self.problem.calibrations if not camera.converged]
         together = StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS
         reason = alone[0] if alone else together.value
@@ -209,11 +209,11 @@ def non_monotonic_sides(fit: RigFit) -> list[int]:
         side
         for side, (camera, given) in enumerate(zip(fit.state.cameras, fit.problem.calibrations, strict=True))
         if fit.free[fit.state.columns.cameras[side]].any()
-        and where_not_monotonic(camera.distortion, _intrinsics(fit, side).A, given.points) is not None
+        and where_not_monotonic(camera.distortion, intrinsics_of(fit, side).A, given.points) is not None
     ]
 
 
-def _intrinsics(fit: RigFit, side: int) -> Intrinsics:
+def intrinsics_of(fit: RigFit, side: int) -> Intrinsics:
     """Intrinsic parameters of one camera [px]; given entries of A keep their exact values."""
     given = fit.problem.calibrations[side]
     estimated = fit.free[fit.state.columns.cameras[side]][:5].copy()
