@@ -12,7 +12,9 @@ dictionaries.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
 from neurocal_cli.observations.markers import DICTIONARIES, code, code_count, correctable
 
 # Dictionaries that may be meant when none is named, those in use most first. The smaller ones of a size are
@@ -59,63 +62,90 @@ class Marks:
         """Some of the markers."""
         return Marks(self.number[which], self.corners[which], self.dictionary)
 
+    def with_others(self, others: Marks | None) -> Marks:
+        """These, and the others that have other numbers."""
+        if others is None:
+            return self
+        more = others.only(~np.isin(others.number, self.number))
+        number = np.concatenate([self.number, more.number])
+        return Marks(number, np.concatenate([self.corners, more.corners]), self.dictionary)
+
+
+@frozen_dataclass(eq=False)
+class View:
+    """An image or a part of it at some scale."""
+
+    image: NDArray[np.uint8]
+    scale: float  # its pixels per pixel of the original
+    origin: tuple[int, int] = (0, 0)  # (u, v) [px of the original] of its first pixel
+
 
 def read_markers(
     grey: NDArray[np.uint8], dictionary: str, first: int, count: int, border: int = 1
 ) -> Iterator[tuple[Marks, Array]]:
-    """Read the markers ``first`` to ``first + count - 1`` of a dictionary, at one or more scales of an image.
+    """Read the markers ``first`` to ``first + count - 1`` of a dictionary, in one or more looks at an image.
 
-    The caller stops when enough of them are read. The quadrangles (N, 4, 2) [px] that may be markers of any
-    dictionary come with them. `border` is the width of a marker's border in cells.
+    Each look adds to those before it, and the caller stops when enough are read. The quadrangles (N, 4, 2) [px]
+    that may be markers of any dictionary come with them. `border` is the width of a border in cells.
     """
     detector = _detector(dictionary, first, count, border)
     if detector is None:
         return
-    for scale in scales_of(grey):
-        corners, ids, rejected = _detected(detector, grey, scale)
-        number = np.zeros(0) if ids is None else np.asarray(ids).reshape(-1)
-        marks = Marks(number.astype(np.int64) + first, _places(corners, scale), dictionary)
-        yield marks, _places([*corners, *rejected], scale)
+    marks: Marks | None = None
+    for look in looks_at(grey):
+        number, corners, rejected = _detected(detector, look)
+        marks = Marks(number + first, corners, dictionary).with_others(marks)
+        yield marks, np.concatenate([corners, rejected])
 
 
-def candidates(grey: NDArray[np.uint8], scale: float) -> Array:
-    """Quadrangles (N, 4, 2) [px] that may be markers of any dictionary, at a scale of an image."""
+def candidates(look: Sequence[View]) -> Array:
+    """Quadrangles (N, 4, 2) [px] that may be markers of any dictionary."""
     detector = _detector(USUAL[0], 0, 1, 1)
-    if detector is None:
-        return np.zeros((0, 4, 2))
-    corners, _, rejected = _detected(detector, grey, scale)
-    return _places([*corners, *rejected], scale)
+    return np.zeros((0, 4, 2)) if detector is None else np.concatenate(_detected(detector, look)[1:])
 
 
-def scales_of(grey: NDArray[np.uint8]) -> list[float]:
-    """Scales of an image at which markers are looked for, one after the other."""
-    longest = max(grey.shape)
-    if longest > _LONGEST:
-        return [0.5 ** int(np.ceil(np.log2(longest / _LONGEST))), 1.0]
-    return [1.0, _ENLARGED] if longest <= _SMALL else [1.0]
+def looks_at(grey: NDArray[np.uint8]) -> Iterator[list[View]]:
+    """Views of an image in which markers are looked for, one list after the other.
+
+    A large image is looked at as a whole at a smaller scale, and then where it may show smaller details.
+    """
+    scaled = [View(grey, 1.0)]
+    while max(scaled[-1].image.shape) > _LONGEST:
+        scaled.append(_scaled(scaled[-1], 0.5))
+    yield scaled[-1:]
+    for coarse, fine in pairwise(scaled[::-1]):
+        factor = round(1 / fine.scale)
+        yield [
+            View(np.ascontiguousarray(fine.image[v, u]), fine.scale, (factor * u.start, factor * v.start))
+            for v, u in dense_parts(Level(grey_levels(coarse.image), 2 * factor))
+        ]
+    if max(grey.shape) <= _SMALL:
+        yield [_scaled(scaled[0], _ENLARGED)]
 
 
-def _detected(detector: Any, grey: NDArray[np.uint8], scale: float) -> tuple[Any, Any, Any]:
-    image = _scaled(grey, scale)
-    parameters = detector.getDetectorParameters()
-    parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(scale, 1.0) / max(image.shape)
-    detector.setDetectorParameters(parameters)
-    corners, ids, rejected = detector.detectMarkers(image)
-    return corners, ids, rejected
+def _detected(detector: Any, look: Sequence[View]) -> tuple[NDArray[np.int64], Array, Array]:
+    """Numbers (M,) and corners (M, 4, 2) of the markers, and corners (N, 4, 2) of other quadrangles [px]."""
+    none = np.zeros((0, 4, 2))
+    numbers, read, others = [np.zeros(0, dtype=np.int64)], [none], [none]
+    for view in look:
+        parameters = detector.getDetectorParameters()
+        parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(view.scale, 1.0) / max(view.image.shape)
+        detector.setDetectorParameters(parameters)
+        corners, ids, rejected = detector.detectMarkers(view.image)
+        for found, places in ((corners, read), (rejected, others)):
+            # OpenCV's corners lie on the centres of the outermost dark pixels.
+            pixels = (np.array(found, dtype=float).reshape(-1, 4, 2) + 0.5) / view.scale - 0.5
+            places.append(pixels + np.array(view.origin))
+        if ids is not None:
+            numbers.append(np.asarray(ids).reshape(-1).astype(np.int64))
+    return np.concatenate(numbers), np.concatenate(read), np.concatenate(others)
 
 
-def _places(corners: Sequence[NDArray[np.float32]], scale: float) -> Array:
-    """Corners (N, 4, 2) [px]; those of OpenCV lie on the centres of the outermost dark pixels."""
-    found = np.array(corners, dtype=float).reshape(-1, 4, 2)
-    return np.asarray((found + 0.5) / scale - 0.5)
-
-
-def _scaled(grey: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
-    if scale == 1:
-        return grey
-    size = [max(1, round(scale * length)) for length in grey.shape[::-1]]
+def _scaled(view: View, scale: float) -> View:
+    size = [max(1, round(scale * length)) for length in view.image.shape[::-1]]
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LANCZOS4
-    return np.asarray(cv2.resize(grey, size, interpolation=how), dtype=np.uint8)
+    image = np.asarray(cv2.resize(view.image, size, interpolation=how), dtype=np.uint8)
+    return View(image, scale * view.scale)
 
 
 def _detector(dictionary: str, first: int, count: int, border: int):  # type: ignore[no-untyped-def]
@@ -198,25 +228,28 @@ def read_codes(grey: NDArray[np.uint8]) -> tuple[list[tuple[Marks, int]], list[t
     A marker of one dictionary may look like one of another, so several dictionaries may be named. The second
     result is what the negative of the image shows.
     """
-    best: tuple[list[tuple[Marks, int]], ...] = ([], [])
-    for scale in scales_of(grey):
-        every = candidates(grey, scale)
-        found = list(codes_in(grey, every)), list(_codes_of_negative(grey, every, scale))
-        best = tuple(max(pair, key=_most) for pair in zip(best, found, strict=True))
-        if _most(best[0]) >= _ENOUGH:
+    seen: tuple[dict[tuple[str, int], Marks], ...] = ({}, {})
+    for look in looks_at(grey):
+        every = candidates(look)
+        for codes, found in zip(
+            seen, (codes_in(grey, every), _codes_of_negative(grey, every, look)), strict=True
+        ):
+            for marks, border in found:
+                codes[marks.dictionary, border] = marks.with_others(codes.get((marks.dictionary, border)))
+        if max(map(len, seen[0].values()), default=0) >= _ENOUGH:
             break
-    return best[0], best[1]
+    positive, negative = ([(marks, border) for (_, border), marks in codes.items()] for codes in seen)
+    return positive, negative
 
 
-def _codes_of_negative(grey: NDArray[np.uint8], every: Array, scale: float) -> Iterator[tuple[Marks, int]]:
+def _codes_of_negative(
+    grey: NDArray[np.uint8], every: Array, look: Sequence[View]
+) -> Iterator[tuple[Marks, int]]:
     """Markers in the negative of an image, whose quadrangles differ by a pixel from those of the image."""
     negative = np.asarray(255 - grey)
-    return codes_in(negative, candidates(negative, scale)) if any(codes_in(negative, every)) else iter(())
-
-
-def _most(found: Sequence[tuple[Marks, int]]) -> int:
-    """The number of markers of the dictionary with the most."""
-    return max((len(marks) for marks, _ in found), default=0)
+    if not any(codes_in(negative, every)):
+        return iter(())
+    return codes_in(negative, candidates([replace(view, image=255 - view.image) for view in look]))
 
 
 def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
