@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.finding.saddles import Image, interpolate
+from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays, predicted
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -31,6 +31,8 @@ from neurocal_cli.observations.board_kinds import CirclePlane
 _WINDOWS = (0.02, 0.06, 0.18)  # of the threshold, over the image's longer side
 _STEPS = (4, 12)  # DN below the mean of the window
 _SHORTEST = 12  # px, least outline
+_WHOLE = 1.4e6  # pixels; larger images are halved first
+_NEIGHBOURS = 8  # saddle points near each other where small circles are looked for, as in `dense_parts`
 _ROUND, _ROUND_PX = 0.04, 0.5  # deviation from an ellipse over its radius, and px of it
 _THIN = 0.1  # least ratio of the axes
 _UNEVEN = 0.15  # further deviation that a rough ellipse, through the outline's moments, may have
@@ -50,22 +52,54 @@ class Blobs:
         return len(self.area)
 
 
-def find_blobs(grey: NDArray[np.uint8]) -> Blobs:
-    """Find dark ellipses; each once, the largest of those with the same centre.
+def find_blobs(grey: NDArray[np.uint8]) -> Iterator[tuple[bool, Blobs]]:
+    """Find dark ellipses, and then light ones, in one or more looks at an image; whether they are light.
 
-    A window smaller than a disc finds a ring along its edge, with an inner outline as well.
+    A large image is looked at as a whole at a smaller scale, and then where it may show smaller details. Each
+    look adds to those before it.
+    """
+    scaled = [grey]
+    while scaled[-1].size > _WHOLE:
+        scaled.append(np.asarray(cv2.pyrDown(scaled[-1]), dtype=np.uint8))
+    found: tuple[list[Array], list[Array]] = ([], [])  # of both, the last look first
+    parts = [(slice(0, None), slice(0, None))]
+    while scaled:
+        look = scaled.pop()
+        scale = 2 ** len(scaled)
+        for light, every in enumerate(found):
+            new = [np.zeros((0, 3))]
+            for v, u in parts:
+                part = np.ascontiguousarray(look[v, u])
+                ellipses = _all_ellipses(255 - part if light else part, max(look.shape))
+                new.append((ellipses + np.array([0.0, u.start, v.start])) * [scale**2, scale, scale])
+            every.insert(0, np.concatenate(new))
+            yield bool(light), _distinct(every)
+        parts = dense_parts(Level(grey_levels(look), 2), _NEIGHBOURS) if scaled else []
+
+
+def _all_ellipses(grey: NDArray[np.uint8], longest: int) -> Array:
+    """Areas and centres (N, 3) of dark ellipses, some of them several times, in an image or a part of one.
+
+    `longest` is the longer side of the image.
     """
     smooth = cv2.GaussianBlur(grey, (3, 3), 0)
     found: list[Array] = []
     for share in _WINDOWS:
-        window = 2 * round(0.5 * share * max(grey.shape)) + 3
+        window = 2 * round(0.5 * share * longest) + 3
         mean = cv2.blur(smooth, (window, window)).astype(np.int16)
         for step in _STEPS:
             dark: NDArray[np.uint8] = (smooth.astype(np.int16) < mean - step).astype(np.uint8)
             outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
             found.append(_ellipses([np.asarray(x)[:, 0] for x in outlines if len(x) >= _SHORTEST], smooth))
-    every = np.concatenate(found)
-    every = every[np.lexsort(every.T[::-1])[::-1]]
+    return np.concatenate(found)
+
+
+def _distinct(looks: list[Array]) -> Blobs:
+    """Each ellipse once, by areas and centres (N, 3): of the first look, the largest with the same centre.
+
+    A window smaller than a disc finds a ring along its edge, with an inner outline as well.
+    """
+    every = np.concatenate([one[np.lexsort(one.T[::-1])[::-1]] for one in looks])
     kept: list[int] = []
     taken = np.zeros(len(every), dtype=bool)
     for k in range(len(every)):
@@ -89,7 +123,8 @@ def _ellipses(outlines: list[NDArray[Any]], image: NDArray[Any]) -> Array:
     # An arc does not enclose what its ellipse does.
     share = np.array([cv2.contourArea(one) + len(one) / 2 for one in outlines]) / area
     good &= (share > 0.7) & (share < 1.3)
-    kept = [k for k in np.flatnonzero(good) if _is_darker(outlines[k], centre[k], image)]
+    round_ones = np.flatnonzero(good)
+    kept = round_ones[_darker([outlines[k] for k in round_ones], centre[round_ones], image)]
     return np.column_stack([area, centre])[kept]
 
 
@@ -139,12 +174,20 @@ def _mean_and_spread(of: NDArray[np.intp], values: Array) -> tuple[Array, Array]
     return mean, np.sqrt(np.bincount(of, (values - mean[of]) ** 2) / count)
 
 
-def _is_darker(outline: NDArray[Any], centre: Array, image: NDArray[Any]) -> bool:
-    """Whether an ellipse is darker than what is around it; around a light disc, a window finds a ring."""
-    beyond = np.rint(centre + _OUTSIDE * (outline - centre)).astype(int)
+def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether ellipses (n,) are darker than what is around them; around a light disc, a window finds a ring."""
+    if not outlines:
+        return np.zeros(0, dtype=np.bool_)
+    of, points = _joined(outlines)
+    beyond = np.rint(centre[of] + _OUTSIDE * (points - centre[of])).astype(int)
     u, v = np.clip(beyond, 0, np.array(image.shape[::-1]) - 1).T
-    x, y = np.rint(centre).astype(int)
-    return bool(image[y, x] < np.median(image[v, u]) - _STEPS[0])
+    levels = image[v, u].astype(float)
+    levels = levels[np.lexsort((levels, of))]
+    count = np.bincount(of)
+    first = np.cumsum(count) - count
+    median = 0.5 * (levels[first + (count - 1) // 2] + levels[first + count // 2])
+    x, y = np.rint(centre).astype(int).T
+    return np.asarray(image[y, x] < median - _STEPS[0])
 
 
 _ALIKE = 2.2  # greatest ratio of the areas of neighbours

@@ -381,22 +381,24 @@ def locate_circles(board: Board, image: NDArray[np.generic]) -> Identified:
     if len(board.planes) > 1 or not isinstance(plane, CirclePlane):
         raise InputError("a board of circles has one plane; describe other planes in files of their own")
     grey = eight_bits(image)
-    found: list[PlacedCircles] = []
-    problems = []
-    for light in (False, True):
-        dark = 255 - grey if light else grey
+    found: dict[bool, PlacedCircles] = {}
+    problems: dict[bool, str] = {}
+    for light, blobs in find_blobs(grey):
         try:
-            placed = place_circles(plane, find_blobs(dark), dark)
+            placed = place_circles(plane, blobs, 255 - grey if light else grey)
         except NoBoardError as error:
-            problems.append(str(error))
+            problems[light] = str(error)
+            found.pop(light, None)
             continue
         if placed is not None:
-            found.append(replace(placed, light=light))
+            found[light] = replace(placed, light=light)
+            if len(placed.place) == plane.cols * plane.rows:
+                break
     if not found:
         usual = "no grid of circles detected; show the whole board, sharp and evenly lit"
-        raise NoBoardError(problems[0] if problems else usual)
+        raise NoBoardError(next(iter(problems.values()), usual))
     # The gaps between circles are a lattice, too, of fewer places.
-    placed = max(found, key=lambda one: len(one.place))
+    placed = max(found.values(), key=lambda one: len(one.place))
     pixels = np.full((plane.rows, plane.cols, 2), np.nan)
     pixels[placed.place[:, 1], placed.place[:, 0]] = placed.centre
     located = Located(Grid(pixels, 0), plane, Placement(0, ((1, 0), (0, 1)), (0, 0)), circles=placed)

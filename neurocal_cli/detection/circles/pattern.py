@@ -26,6 +26,7 @@ _FEWEST = 12  # circles
 _LEAST_SHARE = 0.7  # of a pattern
 _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
+_LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses no rows of smaller ones
 _BENT = 0.1  # greatest median of the second differences of centres, over the step
 _LOPSIDED = 0.06, 0.03  # 0.02 of circles of 6 px
 # Images that show the same full pattern without what is around it, and their least share.
@@ -51,16 +52,25 @@ class SeenCircles:
 def seen_circles(image: NDArray[np.generic]) -> SeenCircles | None:
     """The grid of circles that a grey image shows, dark or light; None if there is none."""
     grey = eight_bits(image)
-    found: list[tuple[int, Blobs, dict[tuple[int, int], int]]] = []
-    for light in (False, True):
-        blobs = find_blobs(255 - grey if light else grey)
-        lattice = largest_lattice(blobs, _MOST_CIRCLES)
-        if len(lattice) >= _FEWEST:
-            found.append((len(lattice), blobs, lattice))
-    if not found:
+    lattices: list[tuple[Blobs, dict[tuple[int, int], int]]] = []
+    for light, blobs in find_blobs(grey):
+        lattices.append((blobs, largest_lattice(blobs, _MOST_CIRCLES)))
+        if light:
+            # The gaps between circles are a lattice, too, of fewer places.
+            blobs, lattice = max(lattices[-2:], key=lambda one: len(one[1]))
+            seen = _seen_in(grey, blobs, lattice)
+            areas = blobs.area[list(lattice.values())]
+            if seen is not None and seen.whole and areas.min() > _LARGE * grey.size:
+                break
+    return seen
+
+
+def _seen_in(
+    grey: NDArray[np.uint8], blobs: Blobs, lattice: dict[tuple[int, int], int]
+) -> SeenCircles | None:
+    """The grid of circles that the largest lattice of ellipses is; None if it is none."""
+    if len(lattice) < _FEWEST:
         return None
-    # The gaps between circles are a lattice, too, of fewer places.
-    _, blobs, lattice = max(found, key=lambda one: one[0])
     index = np.array(list(lattice), dtype=np.int64)
     centre = blobs.centre[list(lattice.values())]
     if _bent(index, centre) > _BENT:

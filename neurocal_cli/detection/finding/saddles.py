@@ -160,7 +160,7 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     return Saddles(points[kept], ports[kept], contrast[kept])
 
 
-def dense_parts(coarse: Level) -> list[tuple[slice, slice]]:
+def dense_parts(coarse: Level, neighbours: int = _NEIGHBOURS) -> list[tuple[slice, slice]]:
     """Rows and columns of the parts of the next finer level that may show squares too small for this one.
 
     Saddle points are steep on both levels if squares have 3 px on the coarser one, but only on the finer one
@@ -169,7 +169,7 @@ def dense_parts(coarse: Level) -> list[tuple[slice, slice]]:
     u, v = _steepest_pixels(coarse, None).astype(np.intp).T
     steep = np.zeros(coarse.image.shape, dtype=np.uint8)
     steep[v, u] = 1
-    near = cv2.boxFilter(steep, cv2.CV_16U, (_NEIGHBOURHOOD,) * 2, normalize=False)[v, u] >= _NEIGHBOURS
+    near = cv2.boxFilter(steep, cv2.CV_16U, (_NEIGHBOURHOOD,) * 2, normalize=False)[v, u] >= neighbours
     height, width = coarse.image.shape
     dense = np.zeros((height // _CELL + 1, width // _CELL + 1), dtype=np.uint8)
     dense[v[near] // _CELL, u[near] // _CELL] = 1

@@ -85,8 +85,8 @@ def read_markers(
 ) -> Iterator[tuple[Marks, Array]]:
     """Read the markers ``first`` to ``first + count - 1`` of a dictionary, in one or more looks at an image.
 
-    Each look adds to those before it, and the caller stops when enough are read. The quadrangles (N, 4, 2) [px]
-    that may be markers of any dictionary come with them. `border` is the width of a border in cells.
+    Each look adds to those before it, and the caller stops when enough are read. With them come quadrangles
+    (N, 4, 2) [px] that may be markers of any dictionary. `border` is the width of a border in cells.
     """
     detector = _detector(dictionary, first, count, border)
     if detector is None:
