@@ -175,7 +175,7 @@ def _mean_and_spread(of: NDArray[np.intp], values: Array) -> tuple[Array, Array]
 
 
 def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether ellipses (n,) are darker than what is around them; around a light disc, a window finds a ring."""
+    """Whether ellipses (n,) are darker than what is around them; windows find rings around light discs."""
     if not outlines:
         return np.zeros(0, dtype=np.bool_)
     of, points = _joined(outlines)
