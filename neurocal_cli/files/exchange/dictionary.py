@@ -23,21 +23,35 @@ import numpy as np
 
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.opencv_names import to_ros
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_names import PARAMETERS, plain, plain_lists
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
+from neurocal_cli.files.exchange.format_table import PoseKeys
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import nested
 
-_COUNTS = {5: "plumb_bob", 8: "rational", 12: "thin_prism", 14: "tilted"}  # coefficients of ordinary lenses
+# One of several cameras, which has its part of each array.
+_MULTIVIEW = CameraKeys(
+    "OpenCV",
+    ("Ks:matrix",),
+    (
+        *(Lens(("0",), ours, ("distortions",)) for ours in ("plumb_bob", "rational", "thin_prism", "tilted")),
+        Lens(("1",), "fisheye", ("distortions",)),
+    ),
+    model="is_fisheye",
+    size=("image_sizes",),
+    name="cam_ids",
+)
+_FROM_FIRST = PoseKeys(("rvecs:vector", "Ts"), needed=True)
+_ARRAYS = ("Ks", "distortions", "rvecs", "Ts", "is_fisheye", "image_sizes")  # the last two may be missing
 _FEWEST = 5
 
 
@@ -45,59 +59,36 @@ def multiview_entries(cameras: CameraSet) -> dict[str, Any]:
     """The dictionary of the cameras: texts and matrices."""
     if any(camera.distortion.model == "omnidir" for camera in cameras.cameras):
         raise InputError("OpenCV's file of several cameras has no omnidirectional ones; write another format")
-    coefficients = [to_ros(c.distortion.model, c.distortion.coefficients)[1] for c in cameras.cameras]
-    width = max(_FEWEST, *map(len, coefficients))
-    padded = np.zeros((len(coefficients), 1, width))
-    for row, k in zip(padded, coefficients, strict=True):
-        row[0, : len(k)] = k
-    tree: dict[str, Any] = {
-        "cam_ids": ",".join(camera.name.replace(",", "_") for camera in cameras.cameras),
-        "Ks": np.stack([camera.A for camera in cameras.cameras]),
-        "distortions": padded,
-        "rvecs": np.stack([to_vector(pose.R) for pose in cameras.mounted]),
-        "Ts": np.stack([pose.t for pose in cameras.mounted]),
-        "is_fisheye": np.array([[float(c.distortion.model == "fisheye")] for c in cameras.cameras]),
-    }
-    sizes = [camera.image_size for camera in cameras.cameras]
-    if None not in sizes:
-        tree["image_sizes"] = np.array(sizes, dtype=float)
-    if cameras.unit is not None:
-        tree["unit"] = cameras.unit
-    return tree
+    trees = [_MULTIVIEW.tree(camera) for camera in cameras.cameras]
+    width = max(_FEWEST, *(len(tree["distortions"]) for tree in trees))
+    for tree, pose in zip(trees, cameras.mounted, strict=True):
+        _FROM_FIRST.put(tree, pose)
+        tree["is_fisheye"] = [float(tree["is_fisheye"])]
+        tree["distortions"] = [np.pad(tree["distortions"], (0, width - len(tree["distortions"])))]
+    stacked = {key: np.array([tree[key] for tree in trees], dtype=float) for key in _ARRAYS}
+    if not stacked["image_sizes"].all():
+        del stacked["image_sizes"]
+    names = ",".join(tree["cam_ids"].replace(",", "_") for tree in trees)
+    return {"cam_ids": names, **stacked, **({} if cameras.unit is None else {"unit": cameras.unit})}
 
 
 def is_multiview(root: Field) -> bool:
     """Whether a dictionary is one of several cameras."""
-    return isinstance(root.value, dict) and {"Ks", "distortions", "rvecs", "Ts"} <= set(root.value)
+    return isinstance(root.value, dict) and set(_ARRAYS[:4]) <= set(root.value)
 
 
 def multiview_cameras(root: Field) -> CameraSet:
     """Read the cameras; see `multiview_entries`."""
-    Ks = _flat(root["Ks"], 9).reshape(-1, 3, 3)
-    n = len(Ks)
+    n = len(_flat(root["Ks"], 9)) // 9
     if not n:
         root["Ks"].fail("a matrix of 3 x 3 for each camera")
-    k, rvecs, Ts = (_of_each(root[key], n) for key in ("distortions", "rvecs", "Ts"))
-    fisheye = np.zeros(n, dtype=bool)
-    if "is_fisheye" in root:
-        fisheye = _of_each(root["is_fisheye"], n)[:, 0] > 0
-    sizes = _of_each(root["image_sizes"], n) if "image_sizes" in root else None
+    arrays = {key: _of_each(root[key], n).tolist() for key in _ARRAYS if key in root}
+    arrays["is_fisheye"] = [str(int(row[0] > 0)) for row in arrays.get("is_fisheye", n * [[0.0]])]
     names = str(root.get("cam_ids", "").value).split(",")
-    cameras = []
-    for c in range(n):
-        count = next((count for count in _COUNTS if not k[c, count:].any()), 0)
-        model = "fisheye" if fisheye[c] else _COUNTS.get(count, "")
-        if not model:
-            root["distortions"].fail("4, 5, 8, 12 or 14 coefficients of each camera")
-        if model == "plumb_bob" and not k[c].any():
-            model = "none"
-        own = k[c, : len(MODELS[model])]
-        size = None if sizes is None else (int(sizes[c, 0]), int(sizes[c, 1]))
-        name = names[c] if len(names) == n else f"cam{c}"
-        cameras.append(Camera(Intrinsics.from_matrix(Ks[c]), Distortion(model, own), size, name))
-    poses = [Pose(from_vector(r), t) for r, t in zip(rvecs, Ts, strict=True)]
-    unit = root.get("unit").value
-    return mounted(cameras, poses, "OpenCV", unit if isinstance(unit, str) else None)
+    arrays["cam_ids"] = names if len(names) == n else [f"cam{k}" for k in range(n)]
+    parts = [Field({key: of[k] for key, of in arrays.items()}, root.source, root.path) for k in range(n)]
+    cameras, poses = map(_MULTIVIEW.camera, parts), map(_FROM_FIRST.read, parts)
+    return mounted(list(cameras), list(poses), "OpenCV", root.read("unit", Field.text))
 
 
 def _of_each(field: Field, n: int) -> Array:
