@@ -23,7 +23,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import STILL, CameraSet, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, listed, table
 from neurocal_cli.files.exchange.tree_paths import python_text, under, yaml_text
 from neurocal_cli.files.tree_fields import Field
 
@@ -183,41 +183,25 @@ MULTICAL = table(
     rig="`camera_poses`, `a_to_b` from b to a",
 )
 
-# Calibrator of calib.io. fy is the focal length times the aspect.
+# Calibrator of calib.io.
+_DATA = "model/ptr_wrapper/data/"
+_IN = f"{_DATA}parameters/"
 _CALIB_IO = CameraKeys(
     "calib.io",
-    ("f/val", "fy", "cx/val", "cy/val"),
-    (Lens(("libCalib::CameraModelOpenCV",), "tilted", tuple(f"{name}/val" for name in MODELS["tilted"])),),
-    model="model",
-    size=("imageSize/width", "imageSize/height"),
+    tuple(f"{_IN}{name}/val" for name in ("f", "f", "cx", "cy")),
+    (Lens(("libCalib::CameraModelOpenCV",), "tilted", tuple(f"{_IN}{k}/val" for k in MODELS["tilted"])),),
+    model="model/polymorphic_name",
+    size=under(f"{_DATA}CameraModelCRT/CameraModelBase/imageSize/", "width", "height"),
+    aspect=f"{_IN}ar/val",
     optional="any",
     complete=True,
-    aside=("ar", "f"),
 )
-
-
-def _calib_io_parts(document: Document) -> dict[str, Field]:
-    parts = {}
-    for k, one in enumerate(document.root["Calibration"]["cameras"].items()):
-        data = one["model"]["ptr_wrapper"]["data"]
-        parameters = data["parameters"]
-        tree = {
-            **parameters.value,
-            "fy": parameters["f"]["val"].number() * parameters["ar"]["val"].number(),
-            "imageSize": data["CameraModelCRT"]["CameraModelBase"]["imageSize"].value,
-            "model": one["model"].get("polymorphic_name", "libCalib::CameraModelOpenCV").text(),
-            "transform": one.get("transform").value,
-        }
-        parts[f"cam{k}"] = Field(tree, one.source, one.path)
-    return parts
-
-
 _MOVED = PoseKeys(("transform/rotation/rx,ry,rz", "transform/translation/x,y,z"))
 CALIB_IO = table(
     _CALIB_IO,
     lambda document: "Calibration" in document.tree and "libCalib" in document.text[:100_000],
     "Calibrator's JSON",
-    parts=_calib_io_parts,
+    parts=listed("Calibration/cameras"),
     pose=lambda parts: [_MOVED.read(part) for part in parts.values()] if len(parts) > 1 else [None],
     unit=None,
     most_cameras=99,
@@ -283,31 +267,18 @@ MRCAL = table(
     rig="a file for each camera, `extrinsics` from a common reference",
 )
 
-# OpenICC (OpenCameraCalibrator), with the lenses of Theia. fy is the focal length times the aspect.
-_OPENICC = CameraKeys(
-    "OpenICC",
-    ("focal_length", "fy", "principal_pt_x", "principal_pt_y"),
-    (
-        Lens(("PINHOLE",), "k1k2", under("radial_distortion_", "1", "2")),
-        Lens(("FISHEYE",), "fisheye", under("radial_distortion_", "1", "2", "3", "4")),
-    ),
-    model="intrinsic_type",
-    size=("image_width", "image_height"),
-    skew="skew",
-)
-
-
-def _openicc_parts(document: Document) -> dict[str, Field]:
-    root = document.root
-    own = root["intrinsics"]
-    tree = {**own.value, "fy": own["focal_length"].number() * own["aspect_ratio"].number()}
-    tree |= {key: root[key].value for key in ("intrinsic_type", "image_width", "image_height")}
-    return {"camera": Field(tree, root.source)}
-
-
+# OpenICC (OpenCameraCalibrator), with the lenses of Theia.
+_THEIA = under("intrinsics/radial_distortion_", "1", "2", "3", "4")
 OPENICC = table(
-    _OPENICC,
+    CameraKeys(
+        "OpenICC",
+        under("intrinsics/", "focal_length", "focal_length", "principal_pt_x", "principal_pt_y"),
+        (Lens(("PINHOLE",), "k1k2", _THEIA[:2]), Lens(("FISHEYE",), "fisheye", _THEIA)),
+        model="intrinsic_type",
+        size=("image_width", "image_height"),
+        skew="intrinsics/skew",
+        aspect="intrinsics/aspect_ratio",
+    ),
     "intrinsic_type intrinsics",
     "camera calibration of OpenCameraCalibrator, JSON",
-    parts=_openicc_parts,
 )

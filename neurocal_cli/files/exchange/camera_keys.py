@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import field
+from itertools import accumulate, chain
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from neurocal_cli.files.exchange.tree_paths import at, find, numbers, numbers_at
 from neurocal_cli.files.tree_fields import Field
 
 NOTHING = "-"  # the place of a coefficient that a program does not have
+_BOOLEANS = {"false": False, "true": True}  # names of lenses
 _POLYNOMIAL = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted")
 
 
@@ -48,6 +50,7 @@ class CameraKeys:
     size: tuple[str, ...] = ()  # width and height, or one path of both
     name: str = ""
     skew: str = ""
+    aspect: str = ""  # of fy over fx, where the intrinsics have fx for both
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
     constants: Mapping[str, Any] = field(default_factory=dict)  # written as they are
     optional: str = ""  # which coefficients a file may lack: all at once, or any
@@ -81,6 +84,8 @@ class CameraKeys:
                 at(root, paths[0]).fail("a 3 x 3 matrix whose last row is 0, 0, 1")
         else:
             K = matrix_of(*(at(root, path).number() for path in paths))
+        if self.aspect:
+            K[1, 1] *= at(root, self.aspect).number()
         if self.skew and (skew := find(root, self.skew)) is not None:
             K[0, 1] = skew.number()
         K[:2, 2] -= self.first_pixel
@@ -101,7 +106,8 @@ class CameraKeys:
         return (width, height) if width and height else None
 
     def _lens(self, root: Field) -> Lens:
-        stated = [entry.text() for path in split(self.model) if (entry := find(root, path)) is not None]
+        entries = [entry for path in split(self.model) if (entry := find(root, path)) is not None]
+        stated = [str(one.value).lower() if type(one.value) is bool else one.text() for one in entries]
         if not stated:
             first = self._fullest(root, self.lenses[0])
             others = [one for one in self.lenses if one.ours != first.ours and one.places == first.places]
@@ -166,11 +172,12 @@ class CameraKeys:
         If `every`, because a coefficient is missing, each number may be it.
         """
         numbered = *self.intrinsics, *lens.intrinsics, *lens.places
-        others = *self.size, *self.constants, *split(self.model), self.name, self.skew
+        others = *self.size, *self.constants, *split(self.model), self.name, self.skew, self.aspect
         paths = [path.partition(":")[0] for path in (*numbered, *others) if path]
         different = [one for one in self.lenses if one.ours not in (lens.ours, "none")]
         words = {_plain(word) for one in different for word in one.words if len(word) > 2}
-        for folder in dict.fromkeys(["", *(path.rpartition("/")[0] for path in paths)]):
+        above = (accumulate(path.split("/")[:-1], "{}/{}".format) for path in paths)
+        for folder in dict.fromkeys(["", *chain.from_iterable(above)]):
             parent = find(root, folder) if folder else root
             start = f"{folder}/" if folder else ""
             known = {path.removeprefix(start).partition("/")[0] for path in paths if path.startswith(start)}
@@ -205,7 +212,8 @@ class CameraKeys:
         for path, value in self.constants.items():
             put(tree, path, value)
         if self.model:
-            put(tree, self.model, lens.words[0].split("-") if "," in self.model else lens.words[0])
+            word = lens.words[0]
+            put(tree, self.model, word.split("-") if "," in self.model else _BOOLEANS.get(word, word))
         if self.name:
             put(tree, self.name, camera.name)
         if self.size:

@@ -21,7 +21,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, table
 from neurocal_cli.files.exchange.tree_paths import toml_text
 from neurocal_cli.files.tree_fields import Field
 
@@ -56,20 +56,11 @@ def _anipose_parts(document: Document) -> dict[str, Field]:
             continue
         if "fisheye" not in part and len(part["distortions"].array(-1)) == len(MODELS["fisheye"]):
             part.refuse(f"{key} has four coefficients; say fisheye = true, or false, for it")
-        fisheye = str(part.get("fisheye", False).boolean()).lower()
         name = f"cam_{key}" if key.isdecimal() else key
-        parts[name] = Field({**part.value, "fisheye": fisheye}, part.source, part.path)
+        parts[name] = Field({"fisheye": False, **part.value}, part.source, part.path)
     if not parts:
         raise InputError("all cameras are to be ignored; set ignore = false for one")
     return parts
-
-
-def _sections_of(start: str, trees: list[Tree], **own: object) -> Tree:
-    """The cameras as sections; in caliscope's `own` keys is the number of each."""
-    return {
-        f"{start}{k}": {**tree, "fisheye": tree["fisheye"] == "true", **own, **({"cam_id": k} if own else {})}
-        for k, tree in enumerate(trees)
-    }
 
 
 ANIPOSE = table(
@@ -80,7 +71,9 @@ ANIPOSE = table(
     pose=PoseKeys(("rotation:vector", "translation"), frame="world"),
     unit=None,
     write=toml_text,
-    whole=lambda trees, cameras: {**_sections_of("cam_", trees), "metadata": {"adjusted": False}},
+    whole=lambda trees, cameras: (
+        {f"cam_{k}": tree for k, tree in enumerate(trees)} | {"metadata": {"adjusted": False}}
+    ),
     skew=True,
     most_cameras=99,
     needs_size=True,
@@ -93,7 +86,10 @@ CALISCOPE = table(
     parts=_anipose_parts,
     pose=PoseKeys(("rotation", "translation"), frame="world"),
     write=toml_text,
-    whole=lambda trees, cameras: _sections_of("cameras.", trees, rotation_count=0, ignore=False),
+    whole=lambda trees, cameras: {
+        f"cameras.{k}": {"cam_id": k, "rotation_count": 0, "ignore": False, **tree}
+        for k, tree in enumerate(trees)
+    },
     skew=True,
     most_cameras=99,
     metres=True,

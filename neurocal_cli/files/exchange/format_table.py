@@ -64,6 +64,7 @@ class PoseKeys:
 
     paths: tuple[str, ...]
     back: bool = False  # whether the pose maps from the camera
+    centre: bool = False  # whether the translation is the place of the camera, of a rotation into the camera
     needed: bool = False  # whether a file without the pose is refused
     from_first: bool = False  # whether the frame is the first camera, which has no pose
     frame: str = "body"  # the pose of a single camera is its view of this name
@@ -87,7 +88,8 @@ class PoseKeys:
         if len(rotation) == 4 and not rotation.any():
             return None
         form = {3: from_vector, 4: from_quaternion}.get(len(rotation))
-        pose = Pose(rotation.reshape(3, 3) if form is None else form(rotation), t)
+        R = rotation.reshape(3, 3) if form is None else form(rotation)
+        pose = Pose(R, -R @ t if self.centre else t)
         return inverse(pose) if self.back else pose
 
     def put(self, tree: Tree, pose: Pose) -> None:
@@ -102,6 +104,11 @@ class PoseKeys:
             put(tree, self.paths[0], np.vstack([pose.D, [0.0, 0.0, 0.0, 1.0]]))
         else:
             put(tree, self.paths[0], np.concatenate([rotation, pose.t]))
+
+
+def listed(path: str) -> Parts:
+    """Cameras in a list, named cam0 and so on."""
+    return lambda document: {f"cam{k}": part for k, part in enumerate(at(document.root, path).items())}
 
 
 Poses = Callable[[Mapping[str, Field]], Sequence[Pose | None]]  # of the cameras of a file

@@ -13,7 +13,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, K4, RADTAN, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import STILL, CameraSet, mounted
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, listed, table
 from neurocal_cli.files.exchange.nearest_lenses import fov
 from neurocal_cli.files.exchange.tree_paths import find, json_text, under, yaml_text
 from neurocal_cli.files.tree_fields import Field
@@ -233,10 +233,6 @@ _SVO = CameraKeys(
 )
 
 
-def _listed(document: Document) -> dict[str, Field]:
-    return {f"cam{k}": part for k, part in enumerate(document.root["cameras"].items())}
-
-
 def _first_camera(document: Document) -> dict[str, Any]:
     cameras = document.tree.get("cameras")
     first = cameras[0] if isinstance(cameras, list) and cameras else {}
@@ -247,7 +243,7 @@ OKVIS = table(
     _OKVIS,
     lambda document: "focal_length" in _first_camera(document),
     "its configuration, YAML",
-    parts=_listed,
+    parts=listed("cameras"),
     pose=PoseKeys(("T_SC",), back=True),
     most_cameras=99,
     metres=True,
@@ -257,7 +253,7 @@ SVO = table(
     _SVO,
     lambda document: "camera" in _first_camera(document),
     "SVO, rpg_vikit, maplab: YAML",
-    parts=_listed,
+    parts=listed("cameras"),
     pose=PoseKeys(("T_B_C",), back=True),
     most_cameras=99,
     metres=True,

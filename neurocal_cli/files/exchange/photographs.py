@@ -105,35 +105,25 @@ NERFSTUDIO = table(
     needs_size=True,
 )
 
-# Nerfies, HyperNeRF and the data of DyCheck: fy is the focal length times the aspect, and the pose is that of
-# the camera in the world.
-_NERFIES = CameraKeys(
-    "Nerfies",
-    ("focal_length", "fy", "principal_point/0", "principal_point/1"),
-    (Lens(("",), "plumb_bob", (*under("radial_distortion/", "0", "1"),
-                               *under("tangential_distortion/", "0", "1"), "radial_distortion/2")),),
-    size=("image_size",),
-    skew="skew",
-    first_pixel=0.5,
-    optional="any",
-)  # fmt: skip
-
-
-def _nerfies_parts(document: Document) -> dict[str, Field]:
-    root = document.root
-    fy = root["focal_length"].number() * root["pixel_aspect_ratio"].number()
-    key = "tangential" if "tangential" in root else "tangential_distortion"
-    R = root["orientation"].array(3, 3)
-    own = {"tangential_distortion": root[key].value, "t": (-R @ root["position"].array(3)).tolist()}
-    return {"camera": Field({**root.value, "fy": fy, **own}, root.source)}
-
-
+# Nerfies, HyperNeRF and the data of DyCheck.
+_RADIAL = under("radial_distortion/", "0", "1", "2")
 NERFIES = table(
-    _NERFIES,
+    CameraKeys(
+        "Nerfies",
+        ("focal_length", "focal_length", "principal_point/0", "principal_point/1"),
+        tuple(
+            Lens(("",), "plumb_bob", (*_RADIAL[:2], f"{key}/0", f"{key}/1", _RADIAL[2]))
+            for key in ("tangential_distortion", "tangential")  # the newer and the older key
+        ),
+        size=("image_size",),
+        skew="skew",
+        aspect="pixel_aspect_ratio",
+        first_pixel=0.5,
+        optional="any",
+    ),
     "orientation position focal_length principal_point",
     "camera of Nerfies, HyperNeRF, DyCheck: JSON",
-    parts=_nerfies_parts,
-    pose=PoseKeys(("orientation", "t"), frame="world"),
+    pose=PoseKeys(("orientation", "position"), centre=True, frame="world"),
     unit=None,
 )
 

@@ -10,13 +10,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import xml_root
 from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Tree, only, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, only, table
 from neurocal_cli.files.exchange.tree_paths import in_order, under
 from neurocal_cli.files.tree_fields import Field
 
@@ -258,6 +257,7 @@ _PIX4D = CameraKeys(
 )
 _PIX4D_HEAD = re.compile(r"\A\s*fileName imageWidth imageHeight\s.*?\[R\|-Rt\] X\s*\n", re.DOTALL).match
 _PIX4D_ROWS = [3, 3, 3, 3, 3, 2, 3, 3, 3, 3]  # words of a name with its size, and numbers
+_PIX4D_POSE = PoseKeys(("R", "t"), centre=True)
 _PIX4D_ORDER = "size:2 K:9 radial:3 tangential:2 t:3 R:9"
 
 
@@ -273,8 +273,8 @@ def _read_pix4d(document: Document) -> CameraSet:
             raise InputError(f"the block of the image {name[:40]!r} is damaged; export the file again")
         part = in_order(_PIX4D_ORDER, words, document.source)
         cameras.append(_PIX4D.camera(part))
-        R = part["R"].array(9).reshape(3, 3)
-        poses[name] = Pose(R, -R @ part["t"].array(3))
+        if (pose := _PIX4D_POSE.read(part)) is not None:
+            poses[name] = pose
     document.warnings.append(
         f"{document.source}: Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
         "which may be half a pixel off"

@@ -135,10 +135,8 @@ def _oak_parts(document: Document) -> dict[str, Field]:
         if not isinstance(entry.value, list) or len(entry.value) != 2:
             entry.fail("a socket and its camera")
         socket, camera = entry.items()
-        if not camera["intrinsicMatrix"].array(3, 3).any():
-            continue
-        kind = {"cameraType": str(int(camera["cameraType"].integer() == 1))}
-        parts[socket.integer()] = Field({**camera.value, **kind}, camera.source, camera.path)
+        if camera["intrinsicMatrix"].array(3, 3).any():
+            parts[socket.integer()] = camera
     return {f"CAM_{chr(ord('A') + number)}": part for number, part in sorted(parts.items())}
 
 
