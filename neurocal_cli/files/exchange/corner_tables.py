@@ -1,4 +1,4 @@
-"""Corners of boards in tables: with places, with the cells of the board, mrcal's, and a file for each view."""
+"""Corners of boards in tables: with places, with cells of the board, mrcal's, and a file for each view."""
 
 from __future__ import annotations
 
