@@ -1,8 +1,9 @@
 """Points in space from their pixels in any number of cameras, in the first camera's frame.
 
-Each point has the smallest squared reprojection error over the cameras that saw it (Gauss-Newton from the
-point nearest to all rays). If the error of a point seen by three cameras or more is too large, one of them
-may show another point: the camera without which the others agree is named, and left out.
+Each point has the smallest squared reprojection error over the cameras that saw it, each weighted by the
+noise of its pixels (Gauss-Newton from the point nearest to all rays). If the error of a point seen by three
+cameras or more is too large, one of them may show another point: the camera without which the others agree is
+named, and left out.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class SpacePoints:
 
     The covariance is that for pixels of covariance 1 px^2; times sigma^2 it is the points'. The error is the
     rms distance of the pixels from the images of the point, per degree of freedom: sqrt(sum(du^2 + dv^2) /
-    (2 n - 3)) for n cameras, an estimate of the pixels' standard deviation.
+    (2 n - 3)) for n cameras, an estimate of the pixels' standard deviation. With a rig both are those of its
+    typical pixel: each camera counts by its own noise over that of all (`Rig.noise_shares`).
     """
 
     points: Array  # (N, 3) [unit of the rig]; nan where fewer than two cameras saw it
@@ -76,6 +78,7 @@ def triangulate_many(
     InputError
         Arrays of different lengths, an unknown camera, or a point twice in one camera.
     """
+    noise = cameras.noise_shares if isinstance(cameras, Rig) else np.ones(len(cameras))
     if isinstance(cameras, Rig):
         poses, cameras = cameras.poses, cameras.cameras
     if poses is None or set(poses) != set(cameras):
@@ -103,7 +106,7 @@ def triangulate_many(
         (one.camera if isinstance(one, Calibration) else one, poses[name]) for name, one in cameras.items()
     ]
     n = 1 + int(point.max(initial=-1))
-    whole = _Views(views, point, rows, pixels, n)
+    whole = _Views(views, noise, point, rows, pixels, n)
     with np.errstate(all="ignore"):
         found = whole.fitted()
         return _without_contradictions(whole, found, limit)
@@ -114,6 +117,7 @@ class _Views:
     """Pixels of n points in some cameras."""
 
     cameras: Sequence[tuple[Camera, Pose]]
+    noise: Array  # (C,) of each camera's pixels
     point: NDArray[np.intp]  # (M,)
     camera: NDArray[np.intp]  # (M,)
     pixels: Array  # (M, 2)
@@ -176,6 +180,8 @@ class _Views:
             fine = fine & ((inside * self.rays[mine]).sum(axis=1) > 0)
             J[mine] = camera.project_jacobian(inside)[1] @ pose.R
             r[mine], seen[mine] = self.pixels[mine] - projected, fine
+        J /= self.noise[self.camera, None, None]
+        r /= self.noise[self.camera, None]
         Jt = np.swapaxes(J, 1, 2)
         all_seen = self.summed((~seen).astype(float)) == 0
         return (

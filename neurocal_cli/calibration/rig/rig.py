@@ -22,6 +22,8 @@ from neurocal_cli.camera.measured import PlaneErrors
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import InputError
 
+_LEAST_NOISE = 0.1  # of a camera's pixels over that of all; fewer points may fit better by chance
+
 
 class FixedCameras(Presented):
     """Cameras that are fixed to each other: their verdict, and what they measure in space."""
@@ -253,6 +255,17 @@ class Rig(FixedCameras):
     def sigma(self) -> float:
         """Standard deviation of the pixels of the calibration, in u and in v [px]."""
         return self.rmse_px / float(np.sqrt(2.0))
+
+    @property
+    def noise_shares(self) -> Array:
+        """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known.
+
+        Of two cameras it tells hardly anything about a point, and is 1.
+        """
+        own = np.array([camera.sigma for camera in self.cameras.values()])
+        if len(own) < 3 or not (self.sigma > 0 and np.isfinite(own).all()):
+            return np.ones(len(own))
+        return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
 
     @property
     def edges(self) -> dict[tuple[str, str], int]:

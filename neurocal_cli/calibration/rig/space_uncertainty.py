@@ -78,11 +78,13 @@ def in_camera(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
     return turned + unit * state.t[side], np.concatenate([-cross_matrix(turned), shift], axis=2)
 
 
-def point_moves(fit: RigFit, points: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
+def point_moves(
+    fit: RigFit, points: Array, seen: NDArray[np.bool_], noise: Array | None = None
+) -> tuple[Array, Array]:
     """How points (N, 3) follow what the frames share, and their covariance by pixels of unit variance.
 
-    They are in the first camera's frame [world unit], and `seen` (C, N) tells which cameras see them. Returns
-    (N, 3, n_shared) and (N, 3, 3) arrays.
+    They are in the first camera's frame [world unit], and `seen` (C, N) tells which cameras see them, each
+    with its `noise` (C,), by default alike. Returns (N, 3, n_shared) and (N, 3, 3) arrays.
     """
     columns = fit.state.columns
     normal = np.zeros((len(points), 3, 3))
@@ -94,7 +96,7 @@ def point_moves(fit: RigFit, points: Array, seen: NDArray[np.bool_]) -> tuple[Ar
         if fit.state.cameras[side].square:
             by_camera[:, :, 0] += by_camera[:, :, 2]
         J = by_point @ fit.state.R[side]
-        Jt = np.swapaxes(J, 1, 2)
+        Jt = np.swapaxes(J, 1, 2) / (1.0 if noise is None else noise[side] ** 2)
         normal[rows] += Jt @ J
         right[np.ix_(rows, axes, columns.cameras[side])] += Jt @ by_camera
         if side:
@@ -180,7 +182,7 @@ def errors_at(rig: Rig | StereoRig, distance: float) -> PlaneErrors:
         )
     points, seen = points[common], seen[:, common]
     fit = fitted(rig)
-    moves, by_pixel = point_moves(fit, points, seen)
+    moves, by_pixel = point_moves(fit, points, seen, rig.noise_shares)
     covariance, variance = shared_covariance(fit), rig.rmse_px**2 / 2
 
     def spread(gain: Array, noise: Array) -> Spread:

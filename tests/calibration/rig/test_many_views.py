@@ -69,6 +69,28 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     assert np.sqrt((found.error**2).mean()) == pytest.approx(0.4, rel=0.03)
 
 
+def test_each_camera_of_a_rig_counts_by_its_noise() -> None:
+    """The covariance is that of the errors, which are smaller than with equal weights."""
+    truth, _ = scene("line", 4, 12)
+    rng, sigma = np.random.default_rng(8), {"cam0": 0.1, "cam1": 0.4, "cam2": 0.1, "cam3": 0.6}
+    rig = calibrate_rig(
+        {name: truth.points(one, rng)[name] for name, one in sigma.items()},
+        skew=False, distortion="k1k2", target="given",
+    )  # fmt: skip
+    assert rig.noise_shares * rig.sigma == pytest.approx(list(sigma.values()), rel=0.15)
+    middle = np.tile([[50.0, -80.0, 2400.0]], (3000, 1))
+    pixels = [
+        camera.camera.project(rig.poses[name].to_camera(middle))[0] + rng.normal(0, sigma[name], (3000, 2))
+        for name, camera in rig.cameras.items()
+    ]
+    rows = np.tile(np.arange(3000), 4), np.repeat(list(sigma), 3000), np.concatenate(pixels)
+    found, alike = triangulate_many(rig, *rows), triangulate_many(rig.cameras, *rows, rig.poses)
+    squares = [((one.points - middle) ** 2).mean(axis=0) for one in (found, alike)]
+    stated = rig.sigma**2 * found.covariance[:, [0, 3, 5]].mean(axis=0)
+    assert squares[0] == pytest.approx(stated, rel=0.3)
+    assert (squares[0] < 0.7 * squares[1]).all()
+
+
 def test_one_wrong_camera_is_named_and_left_out() -> None:
     rng = np.random.default_rng(4)
     rig, _ = scene("line", 4, 4)
