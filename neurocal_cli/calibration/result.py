@@ -248,11 +248,9 @@ def _lens_warnings(solution: Solution) -> Iterator[str]:
     if model == "rich":
         return
     if problem.penalty is not None:
-        yield (
-            f"the distortion model {model} that fits the points best is not monotonic (maps two directions "
-            "to one pixel) in the image's corners, where there are no points; the best monotonic fit is "
-            "used, which is a guess in the corners; add views that show the board there"
-        )
+        from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold
+
+        yield told_of_fold(model)
     # The standard deviations of eucm do not show it: without distortion alpha is 0, and beta has no effect.
     doubtful = not solution.adjusted.converged or model == "eucm"
     if doubtful and solution.model_errors is None and problem.free_distortion:

@@ -108,6 +108,16 @@ def folds_back(problem: Problem, state: CameraState) -> str | None:
     return where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
 
 
+def told_of_fold(lens: str, is_mended: bool = True) -> str:
+    """Warning about a lens, by its model and whose it is, that fits best with a fold in the corners."""
+    used = "the best monotonic fit is used, which is a guess in the corners" if is_mended else "it is kept"
+    return (
+        f"the distortion model {lens} that fits the points best is not monotonic (maps two directions to "
+        f"one pixel) in the image's corners, where there are no points; {used}; add views that show the "
+        "board there"
+    )
+
+
 def _reaches_all(distortion: Distortion, A: Array, points: Correspondences) -> bool:
     """Whether the distortion is certainly monotonic in the rectangle of the image and all points."""
     low, high = points.pixels.min(axis=0), points.pixels.max(axis=0)

@@ -15,7 +15,7 @@ import numpy as np
 from neurocal_cli.adjustment.board.posterior import minimum_of
 from neurocal_cli.adjustment.board.prior import nearest_to_given, prior_of_target
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.lens_choice.monotonic_fit import ROUNDS, TIE, next_penalty
+from neurocal_cli.calibration.lens_choice.monotonic_fit import ROUNDS, TIE, next_penalty, told_of_fold
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, free_parameters, rig_problem
 from neurocal_cli.calibration.rig.covariance import information_of_rig
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
@@ -47,15 +47,9 @@ def adjusted(
     found = _monotonic(fit)
     warnings = []
     for side in non_monotonic_sides(fit):
-        lens, camera = fit.state.cameras[side].distortion, problem.calibrations[side]
-        # The image circle of a wide lens may end within the image.
-        if not (lens.wide and found is fit) and not any("monotonic" in told for told in camera.warnings):
-            used = "it is used" if found is fit else "the best monotonic fit is used, which is a guess there"
-            warnings.append(
-                f"the distortion model {lens.model} of the {names[side]} that fits the points of all cameras "
-                "best is not monotonic (maps two directions to one pixel) in the image's corners, where "
-                f"there are no points; {used}; add views that show the board in the corners"
-            )
+        lens = fit.state.cameras[side].distortion
+        if not (lens.wide and found is fit):  # the image circle of a wide lens may end within the image
+            warnings.append(told_of_fold(f"{lens.model} of the {names[side]}", found is not fit))
     return found, warnings
 
 

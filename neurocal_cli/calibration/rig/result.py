@@ -14,7 +14,7 @@ from neurocal_cli.adjustment.normal_equations import SchurCovariance, solve_scal
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
-from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
+from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice, not_smaller
 from neurocal_cli.camera.distortion import Distortion
@@ -163,11 +163,11 @@ class RigAssembly:
         )
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
-        before: tuple[str, ...] = ()
+        before: tuple[str, ...] = (told_of_fold(camera.model),)
         chosen = bool(given.lens_choice)
         if given.std.keys() >= std.keys():
             alone = Distortion(camera.model, given.distortion)
-            before = parameter_warnings(given.intrinsics, alone, given.std, chosen)
+            before += parameter_warnings(given.intrinsics, alone, given.std, chosen)
         now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
         return {
             "intrinsics": intrinsics,
