@@ -11,7 +11,7 @@ Everything is computed from the rig and its points, so a file can be judged like
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +49,7 @@ from neurocal_cli.camera.geometry import Array, median
 _SCATTER = Limit(6.0, 12.0)
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the views
 _FOLDS = 5
-_NUMBER = re.compile(r"(?<![\w.])\d[\d.]*(?:e[-+]?\d+)?(?: (?:%|px|mm))?")  # in a reason, with its unit
+_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[-+]?\d+)?(?: (?:%|px|mm))?")  # in a reason, with its unit
 _MOST_DIFFERENT = 2  # numbers of reasons that are told together
 
 
@@ -180,7 +180,7 @@ def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     given = any(camera.type != 1 for camera in rig.cameras.values())
     if not given and _SCATTER.grade(e.rest):
         yield from _frames(rig, e)
-    told = told_once(e.cameras)
+    told = told_once({name: verdict.reasons for name, verdict in e.cameras.items()})
     for name, verdict in e.cameras.items():
         if verdict.reasons and (rig.cameras[name].type != 1 or verdict.word == "poor"):
             advice = verdict.advice[0] if verdict.advice else ""
@@ -196,31 +196,37 @@ def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
             yield (1 if k else WORDS.index(verdict.word)), "", advice
 
 
-def told_once(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], str]:
-    """Each reason of a camera with its name; one that several cameras have is the same text for all of them.
+def told_once(texts: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], str]:
+    """Each text of a camera with its name; one that several cameras have is the same for all of them.
 
-    The text has the numbers of the first camera, and in brackets those of the others that differ.
+    It has the numbers of the camera whose first one is the largest, and in brackets those of the others that
+    differ.
     """
     alike: dict[str, dict[str, str]] = {}
-    for name, verdict in verdicts.items():
-        for reason in verdict.reasons:
-            alike.setdefault(_NUMBER.sub("", reason), {}).setdefault(name, reason)
-    told = {(name, why): f"{_named(name)}: {why}" for name, one in verdicts.items() for why in one.reasons}
-    for reasons in alike.values():
-        numbers = {name: _NUMBER.findall(reason) for name, reason in reasons.items()}
-        first, *others = reasons
-        own = {
+    for name, own in texts.items():
+        for text in own:
+            alike.setdefault(_NUMBER.sub("", text), {}).setdefault(name, text)
+    told = {(name, text): f"{_named(name)}: {text}" for name, own in texts.items() for text in own}
+    for several in alike.values():
+        names, numbers = list(several), {name: _NUMBER.findall(text) for name, text in several.items()}
+        first = max(names, key=lambda name: [_value(one) for one in numbers[name]])
+        differ = {
             name: [one for one, before in zip(numbers[name], numbers[first], strict=True) if one != before]
-            for name in others
+            for name in names
         }
-        if others and max(map(len, own.values())) <= _MOST_DIFFERENT:
-            whose = "both cameras" if len(verdicts) == 2 else "all cameras"
-            if len(reasons) < len(verdicts):
-                whose = f"{', '.join([first, *others[:-1]])} and {others[-1]}"
-            besides = [f"{_named(name)}: {', '.join(differ)}" for name, differ in own.items() if differ]
-            text = f"{whose}: {reasons[first]}" + (f" ({'; '.join(besides)})" if besides else "")
-            told |= dict.fromkeys(reasons.items(), text)
+        if len(names) > 1 and max(map(len, differ.values())) <= _MOST_DIFFERENT:
+            whose = "both cameras" if len(texts) == 2 else "all cameras"
+            if len(names) < len(texts):
+                whose = f"{', '.join(names[:-1])} and {names[-1]}"
+            besides = [f"{_named(name)}: {', '.join(own)}" for name, own in differ.items() if own]
+            text = f"{whose}: {several[first]}" + (f" ({'; '.join(besides)})" if besides else "")
+            told |= dict.fromkeys(several.items(), text)
     return told
+
+
+def _value(number: str) -> float:
+    """Of a number with its unit."""
+    return float(number.split()[0])
 
 
 def _named(name: str) -> str:

@@ -16,6 +16,7 @@ from neurocal_cli.calibration.arranged_boards import arranged
 from neurocal_cli.calibration.calibrate import CameraOptions, calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.assessment import told_once
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import ViewPairs, connected_frames
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
@@ -246,8 +247,8 @@ def calibrate_rig(
         outliers=options.get("outliers", "reject"),
         target_kept=found.target_kept,
     )
-    own = [f"{name}: {text}" for name, camera in rig.cameras.items() for text in camera.warnings]
-    return replace(rig, warnings=(*told, *rig.warnings, *own))
+    own = told_once({name: camera.warnings for name, camera in rig.cameras.items()})
+    return replace(rig, warnings=(*told, *rig.warnings, *dict.fromkeys(own.values())))
 
 
 def calibrate_stereo(
