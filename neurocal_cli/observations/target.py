@@ -29,7 +29,10 @@ TargetChoice = Literal["auto", "given", "flat", "free"]
 TARGETS = get_args(TargetChoice)
 
 _OFF = 0.2  # squares; greatest distance of given points from a chessboard's places
-_DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
+_DIGITS = 9  # of what is written of a plane
+# Digits, relative to the target's size, to which coordinates of the same point agree; single precision has 7.
+_AGREED = 6
+_BETWEEN = 1 / np.pi  # of the last one; coordinates in tenths or in sixteenths are not rounded by chance
 N_SHAPES = 3
 """Number of shapes that a bend has."""
 
@@ -304,7 +307,8 @@ def _whole(world: Array, known: Array) -> Array:
     """World coordinates in units of the resolution to which those of the same known point agree."""
     # Each coordinate in one piece, which NumPy runs through ten times as fast.
     size = float(np.ptp(known.T.copy(), axis=1).max()) if len(known) else 1.0
-    return np.round(world / (float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0))
+    unit = float(10.0 ** (np.ceil(np.log10(size)) - _AGREED)) if size > 0 else 1.0
+    return np.round(world / unit + _BETWEEN)
 
 
 @frozen_dataclass(eq=False)

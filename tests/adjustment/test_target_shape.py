@@ -86,6 +86,15 @@ def test_the_quadratic_is_that_of_the_squared_error() -> None:
     assert abs(promised - cost) < 1e-3 * abs(info.cost - cost)
 
 
+def test_points_in_single_precision_are_the_same_points() -> None:
+    points = photographed("parabola", 1, 5)[0]
+    points = replace(points, world=points.world * 0.987654321)
+    single = replace(points, world=points.world.astype(np.float32).astype(float))
+    given, label, _ = distinct_points([points, single])
+    assert len(given) == 63
+    assert (label[: len(points)] == label[len(points) :]).all()
+
+
 def test_the_evidence_of_the_given_target_needs_no_derivatives_by_its_points() -> None:
     one, other = (minimum(photographed("parabola", seed, 5)[0]) for seed in (1, 2))
     _, label, _ = distinct_points([one[0].points, other[0].points])
