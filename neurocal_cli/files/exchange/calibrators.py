@@ -59,7 +59,11 @@ def _kalibr_parts(document: Document) -> dict[str, Field]:
     if "cam0" not in root:
         return {"camera": root}
     count = next(k for k in range(len(document.tree) + 1) if f"cam{k}" not in root)
-    return {f"cam{k}": root[f"cam{k}"] for k in range(count)}
+    parts = {f"cam{k}": root[f"cam{k}"] for k in range(count)}
+    for part in parts.values():
+        if part.get("distortion_coeffs", []).value:
+            part["distortion_model"].text()  # or it is missing
+    return parts
 
 
 def _kalibr_poses(parts: Mapping[str, Field]) -> list[Pose | None]:

@@ -112,14 +112,14 @@ NERFIES = table(
         "Nerfies",
         ("focal_length", "focal_length", "principal_point/0", "principal_point/1"),
         tuple(
-            Lens(("",), "plumb_bob", (*_RADIAL[:2], f"{key}/0", f"{key}/1", _RADIAL[2]))
-            for key in ("tangential_distortion", "tangential")  # the newer and the older key
+            Lens(("",), ours, (*_RADIAL[:2], f"{key}/0", f"{key}/1", *_RADIAL[2:count]))
+            for key in ("tangential", "tangential_distortion")  # the older and the newer key
+            for count, ours in ((2, "k1k2p1p2"), (3, "plumb_bob"))
         ),
         size=("image_size",),
         skew="skew",
         aspect="pixel_aspect_ratio",
         first_pixel=0.5,
-        optional="any",
     ),
     "orientation position focal_length principal_point",
     "camera of Nerfies, HyperNeRF, DyCheck: JSON",
