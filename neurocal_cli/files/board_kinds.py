@@ -32,7 +32,6 @@ SHORT_FORMS = {
     "circles": "circles:COLSxROWS:DISTANCE[:DIAMETER]",
     "asymmetric_circles": "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]",
 }
-_KALIBR = ("target_type", "tagCols", "tagRows", "tagSize", "tagSpacing", "targetCols", "targetRows")
 
 
 def kind_of(plane: Plane) -> str:

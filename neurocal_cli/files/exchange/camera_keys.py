@@ -181,19 +181,18 @@ class CameraKeys:
             parent = find(root, folder) if folder else root
             start = f"{folder}/" if folder else ""
             known = {path.removeprefix(start).partition("/")[0] for path in paths if path.startswith(start)}
-            stems = {key.rpartition(".")[0] for key in known}
             value, listed = None if parent is None else parent.value, False
             if isinstance(value, list) and any(path.startswith(start) for path in numbered):
                 value, listed = {str(k): entry for k, entry in enumerate(value)}, True
             for key, entry in value.items() if isinstance(value, dict) else ():
-                stem, _, last = key.rpartition(".")
-                if key in known or stem not in stems or last in self.aside:
+                if key in known or key in self.aside:
                     continue
                 if isinstance(entry, dict) and "val" in entry:
                     entry = entry["val"]
                 named = isinstance(entry, str) and _plain(entry) in words
-                if named or may_be_distortion(f"k{key}" if listed else last, entry, False, every):
-                    what = f"coefficient {folder}[{key}]" if listed else f"key {key[:60]!r}"
+                if named or may_be_distortion(f"k{key}" if listed else key, entry, False, every):
+                    place = f"{parent.path}." if parent is not None and parent.path else ""
+                    what = f"coefficient {folder}[{key}]" if listed else f"key {place + key[:60]!r}"
                     raise InputError(
                         f"the {what} is not known in {self.program}'s {lens.words[0] or 'cameras'}, and may "
                         "tell their distortion; correct its name, remove it, or calibrate with neurocal from "

@@ -126,7 +126,7 @@ class Format:
     rectified: bool = False  # whether it contains the rectification of a camera
     square: bool = False  # whether its pixels are square
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
-    keys: frozenset[str] = frozenset()  # the first keys of a camera's paths
+    marks: frozenset[str] = frozenset()  # the first keys of a camera's paths
     rig: str = ""  # how the poses of several cameras are stated, for the documentation
 
 

@@ -157,14 +157,15 @@ def table(
             return only([keys.camera(part) for part in found.values()], found, keys.program)
         cameras = [keys.camera(part, name) for name, part in found.items()]
         poses: Sequence[Pose | None] = [None] * len(cameras)
-        if isinstance(pose, PoseKeys):
+        if not isinstance(pose, PoseKeys):
+            poses = poses if pose is None else pose(found)
+        elif not pose.from_first:
             poses = [pose.read(part) for part in found.values()]
-            if pose.from_first and len(poses) > 1:
-                poses = [STILL, *poses[1:]]
-        elif pose is not None:
-            poses = pose(found)
-        stated = unit if pose is not None else None
-        return mounted(cameras, poses, keys.program, stated, getattr(pose, "frame", "body"))
+        elif len(cameras) > 1:
+            poses = [STILL, *map(pose.read, list(found.values())[1:])]
+        alone = pose is None or (getattr(pose, "from_first", False) and len(cameras) == 1)
+        frame = getattr(pose, "frame", "body")
+        return mounted(cameras, poses, keys.program, None if alone else unit, frame)
 
     def text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         assert write is not None
@@ -176,7 +177,7 @@ def table(
 
     wanted = set(matches.split()) if isinstance(matches, str) else set()
     found = {
-        "keys": keys.top,
+        "marks": keys.top,
         "models": keys.models,
         "skew": bool(keys.skew),
         "first_pixel": keys.first_pixel,

@@ -7,78 +7,82 @@ single camera becomes its view ``body``. The centre of the first pixel is (0, 0)
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, K4, RADTAN, CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import STILL, CameraSet, mounted
+from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, listed, table
 from neurocal_cli.files.exchange.nearest_lenses import fov
 from neurocal_cli.files.exchange.tree_paths import find, json_text, under, yaml_text
 from neurocal_cli.files.tree_fields import Field
 
-# ORB-SLAM2 and 3.
+# ORB-SLAM2 and 3: keys that begin with Camera, and those of two cameras with Camera1 and Camera2. OpenVSLAM
+# and stella_vslam have other names of the model and the size, and perhaps a mapping.
+_ORDINARY = ("PinHole", "Rectified", "perspective")
+_ORB = CameraKeys(
+    "ORB-SLAM",
+    ("fx", "fy", "cx", "cy"),
+    (
+        Lens(_ORDINARY, "k1k2p1p2", RADTAN),
+        Lens(_ORDINARY, "plumb_bob", FIVE),
+        Lens(("KannalaBrandt8", "fisheye"), "fisheye", K4),
+    ),
+    model="type",
+    size=("width", "height"),
+    optional="all",
+    aside=("bf", "fps", "focal_x_baseline", "depth_threshold", "imageScale"),
+)
 
 
-def _orb(camera: str, model: str = "type", sides: tuple[str, str] = ("width", "height")) -> CameraKeys:
-    return CameraKeys(
-        "ORB-SLAM" if model == "type" else "OpenVSLAM",
-        under(camera, "fx", "fy", "cx", "cy"),
-        (
-            Lens(("PinHole", "Rectified", "perspective"), "k1k2p1p2", under(camera, *RADTAN)),
-            Lens(("PinHole", "Rectified", "perspective"), "plumb_bob", under(camera, *FIVE)),
-            Lens(("KannalaBrandt8", "fisheye"), "fisheye", under(camera, *K4)),
-        ),
-        model=f"{re.sub(r'[12]', '', camera)}{model}",
-        size=under(re.sub(r"[12]", "", camera), *sides),
-        optional="all",
-        aside=("bf", "fps", "focal_x_baseline", "depth_threshold", "imageScale"),
-    )
-
-
-_LEFT, _RIGHT, _NEWER = _orb("Camera."), _orb("Camera2."), _orb("Camera1.")
-_FROM_RIGHT = PoseKeys(("Stereo.T_c1_c2",), back=True)
-
-
-def _storage(tree: Tree) -> str:
-    return yaml_text(tree, "%YAML:1.0\n---\n")
-
-
-def _read_orb(document: Document) -> CameraSet:
+def _orb_parts(document: Document) -> dict[str, Field]:
     root = document.root
     if "LEFT.K" in root:
         document.notes.append(
             f"{document.source}: Camera.fx to Camera.cy are of the rectified images; LEFT.K, RIGHT.K and the "
             "rest of the original cameras are not read"
         )
-    for start in ("Camera.", "Camera/"):  # OpenVSLAM and stella_vslam
-        if find(root, f"{start}model") is not None:
-            keys = _orb(start, "model", ("cols", "rows"))
-            return CameraSet((keys.camera(root),), program=keys.program)
-    first = _NEWER if "Camera1.fx" in root else _LEFT
-    if "Camera2.fx" not in root:
-        return CameraSet((first.camera(root),), program="ORB-SLAM")
-    root["Stereo.T_c1_c2"]
-    cameras = first.camera(root, "left"), _RIGHT.camera(root, "right")
-    return mounted(cameras, [STILL, _FROM_RIGHT.read(root)], "ORB-SLAM")
+    if isinstance(document.tree.get("Camera"), dict):
+        return {"camera": root["Camera"]}
+    sides = [side for side in ("Camera1", "Camera2") if f"{side}.fx" in root] or ["Camera"]
+    stereo = {"Stereo.T_c1_c2": root.get("Stereo.T_c1_c2").value}
+
+    def own(start: str) -> dict[str, Any]:
+        return {key[len(start) :]: value for key, value in root.value.items() if key.startswith(start)}
+
+    return {
+        name: Field({**own("Camera."), **own(f"{side}."), **stereo}, root.source, side)
+        for name, side in zip(("left", "right") if len(sides) == 2 else ("camera",), sides, strict=True)
+    }
 
 
-def _is_orb(document: Document) -> bool:
-    tree = document.tree
-    below = tree.get("Camera")
-    nested = isinstance(below, dict) and {"model", "setup"} <= set(below)
-    return nested or not {"Camera.fx", "Camera1.fx", "Camera.model"}.isdisjoint(tree)
+def _storage(tree: Tree) -> str:
+    return yaml_text(tree, "%YAML:1.0\n---\n")
 
 
 ORB_SLAM = table(
-    _LEFT,
-    _is_orb,
-    "settings of ORB-SLAM2 and 3, OpenVSLAM, stella_vslam: YAML",
-    read=_read_orb,
+    _ORB,
+    lambda document: not {"Camera.fx", "Camera1.fx"}.isdisjoint(document.tree),
+    "settings of ORB-SLAM2 and 3: YAML",
+    parts=_orb_parts,
+    pose=PoseKeys(("Stereo.T_c1_c2",), back=True, from_first=True),
     write=_storage,
+    whole=lambda trees, cameras: {f"Camera.{key}": value for key, value in trees[0].items()},
     most_cameras=1,
+    marks=frozenset(f"Camera.{key}" for key in ("type", "fx", "fy", "cx", "cy", "width", "height")),
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
+)
+STELLA = table(
+    replace(_ORB, program="OpenVSLAM", model="model", size=("cols", "rows")),
+    lambda document: (
+        "Camera.model" in document.tree
+        or (isinstance(below := document.tree.get("Camera"), dict) and {"model", "setup"} <= set(below))
+    ),
+    "OpenVSLAM, stella_vslam: YAML",
+    parts=_orb_parts,
+    most_cameras=1,
 )
 
 # VINS and camodocal. Their Kannala-Brandt is r = theta + k2 theta^3 + ..., so its k2 is our k1.

@@ -89,6 +89,7 @@ READ: tuple[Format, ...] = (
     odometry.EUROC,
     calibrators.KALIBR,
     calibrators.BOOFCV,
+    odometry.STELLA,
     odometry.ORB_SLAM,
     odometry.VINS,
     odometry.BASALT,
@@ -355,8 +356,8 @@ def _nearest(document: Document) -> str:
     """The format most of whose keys are in a file that is none, and those that it lacks; "" without any."""
     tree = document.tree
     there = {str(key) for part in (tree, *tree.values()) if isinstance(part, dict) for key in part}
-    one = max(READ, key=lambda one: len(one.keys & there) / max(len(one.keys), 1))
-    own = one.keys - _COMMON
+    one = max(READ, key=lambda one: len(one.marks & there) / max(len(one.marks), 1))
+    own = one.marks - _COMMON
     lacks = sorted(own - there)
     if not 0 < len(lacks) <= len(own & there):
         return ""
