@@ -100,6 +100,13 @@ def test_a_model_that_lost_its_way_is_fitted_from_a_better_one(seed: int) -> Non
     assert judged("k1k2p1p2", seed)[1]
 
 
+@pytest.mark.parametrize("seed", [23, 43])
+def test_of_three_views_none_can_be_spared_to_choose_a_lens(seed: int) -> None:
+    scene, _ = bent_set("k1k2", seed)
+    points = scene.points(SIGMA, np.random.default_rng([seed, 1]))
+    assert calibrate(points.select(points.view_index < 3)).distortion_model == "k1k2"
+
+
 @pytest.mark.slow
 def test_what_a_fisheye_leaves_out_the_others_have_when_a_point_is_set_aside() -> None:
     scene, _ = bent_set("fisheye", 1)
