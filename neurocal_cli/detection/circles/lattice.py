@@ -199,7 +199,8 @@ _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
 # Amplitudes of two and of four periods: at most 0.15 and 0.02 of circles of 6 px and more, blurred by up to
 # 3 px and tilted by up to 65 degrees, and of those moved by half of their radius.
-_LOPSIDED = 0.16, 0.055
+_LOPSIDED = 0.16, 0.035
+_RINGS = np.append(np.linspace(0.3, 1.4, 23), 1.5)  # of the radius, where the light is looked at
 _SYMMETRIC = (
     "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
@@ -440,19 +441,23 @@ def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
 
 
 def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tuple[float, float]) -> bool:
-    """Whether marks at places (N, 2) of a board are no circles, by the light where their areas (N,) end.
+    """Whether marks at places (N, 2) of a board are no circles, by the light around their centres.
 
-    Of this light over their contrast, by the angle on the board, long marks have an amplitude of two periods,
-    and squares of four, larger than the `most` of either.
+    Of the light over their contrast, at the distance where it is half-way in the mean, by the angle on the
+    board: long marks have an amplitude of two periods, and squares of four, larger than the `most` of either.
     """
     flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
     steps = predicted(places, places, centre, flattening)[1]
     radius = np.sqrt(area / (np.pi * np.maximum(np.abs(np.linalg.det(steps)), 1e-9)))
     angle = 2 * np.pi * np.arange(16) / 16
     ring = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    shares = (1.0, 0.3, 0.85, 1.15, 1.5)  # a ring may be light in its middle, and end near its hole
-    levels, *others = (interpolate(light, centre[:, None] + share * ring @ steps) for share in shares)
-    contrast = np.ptp(np.median(others, axis=2), axis=0)
-    relative = (levels / np.maximum(contrast, 1.0)[:, None]).mean(axis=0)
-    amplitudes = (np.abs((relative * np.exp(1j * n * angle)).mean()) for n in (2, 4))
+    levels = interpolate(light, centre[:, None] + _RINGS[:, None, None, None] * (ring @ steps))
+    contrast = np.ptp(np.median(levels, axis=2), axis=0)
+    relative = (levels / np.maximum(contrast, 1.0)[:, None]).mean(axis=1)
+    mean, within = relative.mean(axis=1), np.count_nonzero(_RINGS < 1)
+    # A ring may be light in its middle.
+    inner = np.abs(mean[:within] - mean[-1]).argmax()
+    outer = within + np.abs(mean[within:] - mean[inner]).argmax()
+    half = np.abs(mean[inner : outer + 1] - 0.5 * (mean[inner] + mean[outer])).argmin()
+    amplitudes = (np.abs((relative[inner + half] * np.exp(1j * n * angle)).mean()) for n in (2, 4))
     return any(one > limit for one, limit in zip(amplitudes, most, strict=True))
