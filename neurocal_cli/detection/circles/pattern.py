@@ -32,6 +32,7 @@ _LOPSIDED = 0.06, 0.012  # at most 0.01 of circles, and 0.015 and more of square
 # Images that show the same full pattern without what is around it, and their least share.
 _AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
+_MOST_OF_SIDE = 0.6  # of the places beside a pattern; a row there is full, or the pattern is not
 
 
 @frozen_dataclass
@@ -82,7 +83,7 @@ def _seen_in(
     if lopsided(grey.astype(np.float32), places, centre, area, _LOPSIDED):
         return None
     full = share == 1
-    return replace(seen, whole=full and _ends_seen(places, centre, seen, grey.shape), full=full)
+    return replace(seen, whole=full and _ends_seen(places, centre, area, grey.shape), full=full)
 
 
 def _likelihood(one: tuple[float, SeenCircles, Array]) -> tuple[float, bool, int]:
@@ -120,17 +121,21 @@ def _bent(index: NDArray[np.int64], centre: Array) -> float:
     return float(np.median(bent)) if bent else np.inf
 
 
-def _ends_seen(places: Array, centre: Array, seen: SeenCircles, shape: tuple[int, ...]) -> bool:
-    """Whether the places around the pattern lie in the image, where further circles would have been found."""
+def _ends_seen(places: Array, centre: Array, area: Array, shape: tuple[int, ...]) -> bool:
+    """Whether on each side of the pattern most of the next circles would lie in the image, and be found."""
     H = homographies(places[None], centre[None])
     low, high = places.min(axis=0) - 1, places.max(axis=0) + 1
     x, y = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
-    around = np.concatenate(
-        [np.column_stack([x, np.full(len(x), end)]) for end in (low[1], high[1])]
-        + [np.column_stack([np.full(len(y), end), y]) for end in (low[0], high[0])]
+    room = 1 + np.sqrt(float(np.median(area)) / np.pi)
+
+    def seen(x: Array, y: Array) -> bool:
+        pixels = homography_at(H, np.stack(np.broadcast_arrays(x, y), axis=-1)[None])[0]
+        inside = ((pixels >= room) & (pixels < np.array(shape[::-1]) - room)).all(axis=1)
+        return bool(np.count_nonzero(inside) >= _MOST_OF_SIDE * len(pixels))
+
+    return all(seen(x, np.array(end)) for end in (low[1], high[1])) and all(
+        seen(np.array(end), y) for end in (low[0], high[0])
     )
-    pixels = homography_at(H, around[None])[0]
-    return bool(((pixels >= 0) & (pixels < shape[::-1])).all())
 
 
 def agreed_circles(seen: Sequence[SeenCircles]) -> tuple[CirclePlane, bool]:
