@@ -92,7 +92,8 @@ def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
     damping = 0.0
     for _ in range(_STEPS):
         error = _errors(np.vstack([best, best + np.diag(change)]), scaled, pixels)[1]
-        slopes = (error[1:] - error[0]).T / change
+        with np.errstate(invalid="ignore"):  # vertices that no lens of this focal length sees
+            slopes = (error[1:] - error[0]).T / change
         normal = slopes.T @ slopes + np.diag([0.0, prior**2, prior**2])
         gradient = slopes.T @ error[0] + prior**2 * np.concatenate([[0.0], best[1:] - middle])
         if not np.isfinite(normal).all():
