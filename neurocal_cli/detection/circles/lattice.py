@@ -35,7 +35,8 @@ _WHOLE = 1.4e6  # pixels; larger images are halved first
 _NEIGHBOURS = 8  # saddle points near each other where small circles are looked for, as in `dense_parts`
 _ROUND, _ROUND_PX = 0.04, 0.5  # deviation from an ellipse over its radius, and px of it
 _THIN = 0.1  # least ratio of the axes
-_UNEVEN = 0.15  # further deviation that a rough ellipse, through the outline's moments, may have
+_COMPACT = 0.02  # least area over the squared length of an outline; 0.02 of the thinnest ellipse
+_UNEVEN = 0.08  # further deviation that a rough ellipse, through the outline's moments, may have
 _OUTSIDE = 1.25  # radii, where it is lighter
 _SAME = 0.5  # radii of the smaller one between centres of the same blob
 
@@ -86,12 +87,18 @@ def _all_ellipses(grey: NDArray[np.uint8], longest: int) -> Array:
     found: list[Array] = []
     for share in _WINDOWS:
         window = 2 * round(0.5 * share * longest) + 3
-        mean = cv2.blur(smooth, (window, window)).astype(np.int16)
+        mean = cv2.blur(smooth, (window, window))
         for step in _STEPS:
-            dark: NDArray[np.uint8] = (smooth.astype(np.int16) < mean - step).astype(np.uint8)
+            dark = (smooth < np.maximum(mean, step) - np.uint8(step)).view(np.uint8)
             outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-            found.append(_ellipses([np.asarray(x)[:, 0] for x in outlines if len(x) >= _SHORTEST], smooth))
+            compact = (x for x in outlines if len(x) >= _SHORTEST and _is_compact(x))
+            found.append(_ellipses([np.asarray(x)[:, 0] for x in compact], smooth))
     return np.concatenate(found)
+
+
+def _is_compact(outline: Any) -> bool:
+    """Whether an outline encloses as much as that of a thin ellipse; the others are long, and many."""
+    return cv2.contourArea(outline) + len(outline) / 2 >= _COMPACT * len(outline) ** 2
 
 
 def _distinct(looks: list[Array]) -> Blobs:

@@ -23,8 +23,9 @@ Image = NDArray[np.float32]
 # _SMOOTHING, _SMALLEST and _LEAST_NOISE are insensitive; the others bound memory.
 _SMOOTHING = 1.0  # px; reduces noise and aliasing
 _SMALLEST = 100  # px; shorter side of the smallest level
-_LARGE = 2_000_000  # pixels; in larger images the noise is measured only in bands ...
-_BANDS, _ROWS_OF_BAND = 24, 24  # ... to save time and memory: number of bands, and rows of a band
+_LARGE = 1_400_000  # pixels; in larger images the noise is measured only in bands ...
+# ... to save time and memory: number of bands, rows of a band, and its share of the image's width.
+_BANDS, _ROWS_OF_BAND, _SHARE_OF_BAND = 24, 24, 4
 _ROWS = 32000  # rows per call of cv2.remap, which counts them in 16 bits
 _LEAST_NOISE = 0.12  # DN/px^2; caused by rounding to 8 bits
 
@@ -83,9 +84,12 @@ class Level:
         if self.image.size <= _LARGE:
             sparse = self.curvature[1][::4, ::4]
         else:
-            first = np.linspace(0, len(self.image) - _ROWS_OF_BAND, _BANDS).astype(int)
-            bands = [Level(self.image[v : v + _ROWS_OF_BAND], self.scale).curvature[1] for v in first]
-            sparse = np.concatenate([band[4:-4:4, ::4] for band in bands])
+            first = np.linspace(0, len(self.image) - _ROWS_OF_BAND, _BANDS).astype(int).tolist()
+            width = self.image.shape[1] // _SHARE_OF_BAND
+            places = [(v, width * (k % _SHARE_OF_BAND)) for k, v in enumerate(first)]
+            parts = [self.image[v : v + _ROWS_OF_BAND, u : u + width] for v, u in places]
+            bands = [Level(part, self.scale).curvature[1] for part in parts]
+            sparse = np.concatenate([band[4:-4:4, 4:-4:4] for band in bands])
         return max(float(np.median(np.abs(sparse))) / 0.6745, _LEAST_NOISE)
 
 
@@ -166,7 +170,8 @@ def dense_parts(coarse: Level, neighbours: int = _NEIGHBOURS) -> list[tuple[slic
     Saddle points are steep on both levels if squares have 3 px on the coarser one, but only on the finer one
     the directions of their edges can be measured. Around an inner vertex of 3 x 3, the others are near.
     """
-    u, v = _steepest_pixels(coarse, None).astype(np.intp).T
+    points = _steepest_pixels(coarse, None)
+    u, v = points[_ports_from_curvature(coarse, points)[1]].astype(np.intp).T
     steep = np.zeros(coarse.image.shape, dtype=np.uint8)
     steep[v, u] = 1
     near = cv2.boxFilter(steep, cv2.CV_16U, (_NEIGHBOURHOOD,) * 2, normalize=False)[v, u] >= neighbours
