@@ -163,14 +163,25 @@ def test_photographs_of_circles_tell_their_pattern(real_files: RealFiles) -> Non
         assert (kind_of(plane), plane.cols, plane.rows) == ("asymmetric_circles", 7, 10)
 
 
-def test_squares_in_a_grid_are_no_circles() -> None:
+@pytest.mark.parametrize("side", [9, 20])
+def test_squares_in_a_grid_are_no_circles(side: int) -> None:
     image = np.full((300, 400), 20, np.uint8)
     for row in range(8):
         for column in range(10):
             left, top = 45 + 32 * column, 25 + 32 * row
-            cv2.rectangle(image, (left, top), (left + 20, top + 20), (230,), -1)
-    for blur in (1.0, 2.0):
+            cv2.rectangle(image, (left, top), (left + side, top + side), (230,), -1)
+    for blur in (1.0, 1.5):
         assert seen_circles(cv2.GaussianBlur(image, (0, 0), blur)) is None
+
+
+@pytest.mark.parametrize(
+    ("form", "square"), [("charuco:6x5:40:30:DICT_4X4_50", 24.0), ("circles:7x6:20:12", 13.0)]
+)
+def test_small_boards_in_large_images_are_found(form: str, square: float) -> None:
+    image = np.full((1500, 2400), 200, np.uint8)
+    image[700:940, 1300:1620] = taken(marked_scene(plane_of(form), 1, square=square), 1, 4).image
+    found, true = found_board([image]).plane, plane_of(form)
+    assert (kind_of(found), found.cols, found.rows) == (kind_of(true), true.cols, true.rows)
 
 
 def test_squares_among_others_are_no_board() -> None:
