@@ -202,7 +202,7 @@ def homography_at(H: Array, ground: Array) -> Array:
 
 
 _WITHIN = (-0.25, 0.0, 0.25)  # of a cell, where it is sampled
-_WRONG_BORDER = 0.1  # greatest share of light cells in a border
+_WRONG_BORDER, _ROUGHLY_WRONG = 0.1, 0.3  # greatest share of light cells in a border
 _EXTREME = 0.2  # share of the darkest and of the lightest cells that give the levels
 _CONTRAST = 12.0  # DN, least difference of these
 _FEWEST = 2  # markers
@@ -317,17 +317,19 @@ def _cells(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Light cells (N, bits, bits) of codes, and (N,) whether the border is dark."""
     side = bits + 2 * border
-    ticks = (np.arange(side)[:, None] + 0.5 + np.array(_WITHIN)).ravel() / side
-    places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    sampled = _sampled(grey, H, places)
-    n = len(_WITHIN)
-    level = sampled.reshape(len(H), side, n, side, n).mean(axis=(2, 4))
-    low, high = _levels(level.reshape(len(H), -1))
-    light = level > 0.5 * (low + high)[:, None, None]
-    inner = light[:, border:-border, border:-border]
-    around = side * side - bits * bits
-    wrong = light.sum(axis=(1, 2)) - inner.sum(axis=(1, 2))
-    return inner, (wrong <= _WRONG_BORDER * around) & (high - low > _CONTRAST)
+    inner, good = np.zeros((len(H), bits, bits), dtype=np.bool_), np.ones(len(H), dtype=np.bool_)
+    # A look at the middles of the cells leaves few.
+    for within, most in (((0.0,), _ROUGHLY_WRONG), (_WITHIN, _WRONG_BORDER)):
+        ticks = (np.arange(side)[:, None] + 0.5 + np.array(within)).ravel() / side
+        places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+        n, at = len(within), np.flatnonzero(good)
+        level = _sampled(grey, H[at], places).reshape(len(at), side, n, side, n).mean(axis=(2, 4))
+        low, high = _levels(level.reshape(len(at), -1))
+        light = level > 0.5 * (low + high)[:, None, None]
+        inner[at] = light[:, border:-border, border:-border]
+        wrong = light.sum(axis=(1, 2)) - inner[at].sum(axis=(1, 2))
+        good[at] = (wrong <= most * (side * side - bits * bits)) & (high - low > _CONTRAST)
+    return inner, good
 
 
 def _matched(light: NDArray[np.bool_], dictionary: str) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
