@@ -323,6 +323,8 @@ def _cells(
         ticks = (np.arange(side)[:, None] + 0.5 + np.array(within)).ravel() / side
         places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         n, at = len(within), np.flatnonzero(good)
+        if not len(at):
+            break
         level = _sampled(grey, H[at], places).reshape(len(at), side, n, side, n).mean(axis=(2, 4))
         low, high = _levels(level.reshape(len(at), -1))
         light = level > 0.5 * (low + high)[:, None, None]
