@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import quietly
-from neurocal_cli.adjustment.normal_equations import Arrowhead, solve_scaled
+from neurocal_cli.adjustment.normal_equations import NOTHING, Arrowhead, solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.motion import motion_of
@@ -300,8 +300,9 @@ class _Rivals:
     def independent(self, found: Found[RigCause], subject: int) -> float:
         """Share of the degrees of freedom that are independent, by what the cause leaves in each view.
 
-        A sum of squares varies the more, the fewer of them it is made of (Satterthwaite). A cause beyond the
-        linear range leaves much in few views, so what is there without it counts as well.
+        A sum of squares varies as one of fewer (Satterthwaite) if some are much larger: of those views that
+        do not fit, or along those axes of all poses that the pixels determine best. A cause beyond the linear
+        range leaves much in few views, so what is there without it counts as well.
         """
         problem, squares = self.fit.problem, []
         weights = np.zeros(len(problem.scale))
@@ -315,10 +316,13 @@ class _Rivals:
             S, X, by_cause = S[:, :6, :6], X[:, :6], S[:, :6, 6:] @ found.amounts
             step = X[:, :, :-1] @ found.camera + weights[frames, None] * by_cause
             left = np.stack([X[:, :, -1], X[:, :, -1] - step], axis=2)
-            squares.append((left * solve_scaled(S, left)).sum(axis=1))
-        of_views = np.concatenate(squares)
-        share = 2 * of_views.mean(axis=0) ** 2 / of_views.var(axis=0) / 6
-        return float(np.minimum(np.nan_to_num(share, nan=1.0), 1.0).max())
+            values, axes = np.linalg.eigh(S)
+            along_axes = np.swapaxes(axes, 1, 2) @ left
+            squares.append(along_axes**2 / np.maximum(values, NOTHING)[..., None])
+        own = np.concatenate(squares)
+        views, mean = own.mean(axis=1), own.mean(axis=(0, 1))
+        shares = mean**2 * np.array([3 / (own**2).mean(axis=(0, 1)), 1 / (3 * views.var(axis=0))])
+        return float(np.minimum(shares.min(axis=0), 1.0).max())
 
 
 def _named(
