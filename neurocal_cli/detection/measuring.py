@@ -55,7 +55,7 @@ from neurocal_cli.detection.fitting.strips import GridEdges, GridImage, grid_lin
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.markers.ink import Ink
-from neurocal_cli.detection.markers.plain import fit_without_ink
+from neurocal_cli.detection.markers.ink_fit import fit_with_ink
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.observations.measured_directions import variance_across
 
@@ -96,7 +96,7 @@ def measure(
     if len(grid_image.edges.index) == 0:
         index = np.zeros((0, 2), dtype=np.int64)
         return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
-    fitted = fit_grid(grid_image) if ink is None else fit_without_ink(light, grid, floor, ink)
+    fitted = fit_grid(grid_image) if ink is None else fit_with_ink(light, grid, floor, ink)
     grid_image = fitted.grid_image
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":

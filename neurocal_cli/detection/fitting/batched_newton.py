@@ -9,7 +9,7 @@ equations are solved in float64.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -41,7 +41,8 @@ class PerFit:
 
     def part(self: Some, which: Part) -> Some:
         """Select some fits."""
-        return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(self, **{name: x[which] for name, x in values.items() if x is not None})
 
 
 @frozen_dataclass(eq=False)
@@ -53,6 +54,7 @@ class FitPixels(PerFit):
     Q: Single  # effect of other lines on the light; see the models
     root: Single  # [1/DN] inverse standard deviation of the noise; 0 for pixels that are not used
     beyond: Array  # (E,) share of the pixels that lie outside the image
+    ink: Single | None = field(default=None, kw_only=True)  # what markers add to the light
 
     def weighed(self: Pixels, weight: Single) -> Pixels:
         """Set the weights [1/DN^2] of the pixels; unused pixels stay unused."""

@@ -3,13 +3,13 @@
 With (s, d) the coordinates of `Lines` and z = (d - offset - tilt s / (half length)) / sigma, the intensity
 around an edge is
 
-    I = A(u, v) + B(u, v) F(x),   x = E(z) Q + phi(z) R
+    I = A(u, v) + B(u, v) F(x),   x = E(z) Q + phi(z) R + ink
 
 A and B are mean level and half contrast, with fixed gradients. E and F are `edge_profile.profile` and
 `response`. Q and R are the effect of other lines. Q is a product of erf(t). The t are the distances in sigma
 from the lines that cross the edge at both ends and from its two parallel neighbours. R corrects Q for the
 crossing angle: blurring sign(z) sign(t) gives erf erf + 4 rho phi phi + ..., with rho the cosine of the angle
-between the normals.
+between the normals. The ink of markers beside the edge is known; see `markers.ink`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
 )
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density, response, sharp_profile
 from neurocal_cli.detection.fitting.shading import Shading
-from neurocal_cli.detection.fitting.strips import Lines, Single, Strips, strip_pixels
+from neurocal_cli.detection.fitting.strips import GridImage, Lines, Single, Strips, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 
 # Half of REACH raises errors by 16 %; doubled, it lowers them by 2 %, with twice the pixels. Half of SHARP
@@ -59,7 +59,7 @@ class EdgePixels(FitPixels):
 
 
 def edge_pixels(
-    image: NDArray[np.generic],
+    grid_image: GridImage,
     lines: Lines,
     sigma: Array,
     shading: Shading,
@@ -75,7 +75,8 @@ def edge_pixels(
     """
     crossed = np.ones((len(sigma), 2), dtype=np.bool_) if crossed is None else crossed
     trim = (_RIM * lines.length + _RIM_BLUR * sigma)[:, None] * ~crossed
-    strips = strip_pixels(image, lines, np.minimum(reach, 0.5 * lines.width), trim, stride)
+    half = np.minimum(reach, 0.5 * lines.width)
+    strips = strip_pixels(grid_image.image, lines, half, trim, stride, grid_image.ink)
     nearest = np.where(sigma < SHARP, _NEAREST_SHARP / sigma, _NEAREST)
     if stride > 1:
         nearest = np.maximum(nearest, np.minimum(_NEAREST_FIRST, _ENDS * lines.length / sigma))
@@ -103,7 +104,8 @@ def edge_pixels(
             Q[close] *= erf_and_density(t)[0]
     lever = strips.s / (0.5 * lines.length).astype(np.float32)[:, None]
     value, gain = shading.off(lines.middle, strips.u, strips.v, strips.value)
-    return EdgePixels(value, gain, Q, used.astype(np.float32), strips.beyond, lever, strips.d, R)
+    root = used.astype(np.float32)
+    return EdgePixels(value, gain, Q, root, strips.beyond, lever, strips.d, R, ink=strips.ink)
 
 
 def usual_stride(lines: Lines) -> int:
@@ -155,7 +157,8 @@ def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> 
 def light_at(data: EdgePixels, values: Array) -> Single:
     """Approximate the light x (E, N) between the levels, for the weights, which vary slowly with it."""
     offset, sigma = (values[:, k, None].astype(np.float32) for k in (OFFSET, BLUR))
-    return np.asarray(erf_and_density((data.d - offset) / sigma)[0] * data.Q, dtype=np.float32)
+    x = erf_and_density((data.d - offset) / sigma)[0] * data.Q
+    return np.asarray(x if data.ink is None else x + data.ink, dtype=np.float32)
 
 
 def edge_model(data: EdgePixels, values: Array, shape: ProfileShape) -> Linearised:
@@ -169,6 +172,8 @@ def edge_model(data: EdgePixels, values: Array, shape: ProfileShape) -> Linearis
     density *= data.R
     x *= data.Q
     x += density
+    if data.ink is not None:
+        x += data.ink
     density *= z
     slope *= data.Q
     slope -= density

@@ -33,9 +33,10 @@ so it can be undone without a loss, and without amplifying the noise: the image 
 camera without sharpening, whose noise is nearly white again. `find_sharpening` fits k and r to the mean
 profile of all edges,
 
-    m + S [a E + b phi + c (1 - E^2) E],   E = erf(z / sqrt 2),
+    m + S [a E + b phi + c sign(z) phi],   E = erf(z / sqrt 2),
 
-with phi the normal density. The terms b and c describe a shift of the edges and the nonlinear response.
+with phi the normal density. The terms b and c describe a shift of the edges, c if their one side is the
+reflection of the other.
 """
 
 from __future__ import annotations
@@ -348,11 +349,11 @@ def _left(profile: EdgeProfile, sigma: Array, radius: Array, amount: Array) -> t
         (fine[..., None, :] + k * (fine - smooth)[..., None, :])
         for fine, smooth in ((E, E_wide), (density, density_wide))
     )
-    at = np.stack([np.ones_like(step), step, bump], axis=-1)
+    at = np.stack([np.ones_like(step), step, bump, np.sign(d) * bump], axis=-1)
     root = np.sqrt(profile.count / profile.count.max())
     rows, wanted = at * root[:, None], root * profile.light
     normal = rows.swapaxes(-1, -2) @ rows
-    solution = np.linalg.solve(normal + _RIDGE * np.eye(3), (wanted @ rows)[..., None])
+    solution = np.linalg.solve(normal + _RIDGE * np.eye(4), (wanted @ rows)[..., None])
     rest = ((rows @ solution)[..., 0] - wanted) ** 2
     above = (at[..., 1:] @ solution[..., 1:, :])[..., 0]
     height = np.maximum(solution[..., 1, 0], 1e-9)

@@ -220,7 +220,7 @@ def _first_fit(
     """Fit edges with independent levels, and the map through them."""
     lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, levels, noise)
+    fit = fit_initial(grid_image, lines, offset, sigma, shading, levels, noise)
     good = is_typical(fit, lines.middle)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
@@ -344,7 +344,7 @@ def _fine_fit(
         # A fit that failed in the dark rim of the image starts at the map again.
         offset = np.where(first.good, offset, shift)
     crossed = grid_image.edges.known
-    fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise, crossed)
+    fit = _fitted(grid_image, lines, offset, blur, shading, shape, noise, crossed)
     usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The error of the profile, estimated from a part of the pixels, now dominates: estimate it again.
@@ -355,7 +355,7 @@ def _fine_fit(
 
 
 def _fitted(
-    image: NDArray[np.generic],
+    grid_image: GridImage,
     lines: Lines,
     offset: Array,
     blur: tuple[Array, Array],
@@ -366,7 +366,7 @@ def _fitted(
 ) -> BatchFit:
     """Fit edges to all their pixels from initial offsets (E,), with the common parameters of the board."""
     sigma, spread = blur
-    data = edge_pixels(image, lines, sigma, shading, REACH * sigma, 1, crossed)
+    data = edge_pixels(grid_image, lines, sigma, shading, REACH * sigma, 1, crossed)
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), prior.mean], axis=1)
     data = data.weighed(noise.weights(light_at(data, start)))
@@ -379,7 +379,7 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     lines = edges.lines(fitted.map.map)
     shift = fitted.shifts.terms(lines) @ fitted.map.shift
     fit = _fitted(
-        grid_image.image,
+        grid_image,
         lines,
         shift,
         fitted.blur.at(lines),

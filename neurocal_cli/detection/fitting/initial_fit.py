@@ -24,7 +24,7 @@ from neurocal_cli.detection.fitting.common_parameters import profile_shape
 from neurocal_cli.detection.fitting.edge_fit import REACH, SHARP, edge_model, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis, half_widths
 from neurocal_cli.detection.fitting.shading import Shading
-from neurocal_cli.detection.fitting.strips import Lines
+from neurocal_cli.detection.fitting.strips import GridImage, Lines
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 
 # Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/support/rendered.py).
@@ -56,7 +56,7 @@ _MOST_STEP, _MOST_MOVE = 1.0, 0.03
 
 
 def fit_initial(
-    image: NDArray[np.generic],
+    grid_image: GridImage,
     lines: Lines,
     offset: Array,
     sigma: float,
@@ -71,7 +71,7 @@ def fit_initial(
     """
     known = np.stack([*levels, np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
-    started = _few_steps(image, lines, start, known, shading, noise)
+    started = _few_steps(grid_image, lines, start, known, shading, noise)
     typical = is_typical(started, lines.middle)
     found = upper_median(started.values[typical, BLUR]) if typical.any() else sigma
     # The effect of crossing lines on the pixels depends on the blur.
@@ -79,18 +79,18 @@ def fit_initial(
         known[:, 2] = found
         start = np.where(typical[:, None], started.values, start)
         start[:, BLUR] = found
-        again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
+        again = _with_best_profile(_few_steps(grid_image, lines, start, known, shading, noise), lines, found)
         if upper_median(again.chi2_per_pixel) < _WORSE * upper_median(started.chi2_per_pixel):
             return again
     return _with_best_profile(started, lines, sigma)
 
 
 def _few_steps(
-    image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
+    grid_image: GridImage, lines: Lines, start: Array, known: Array, shading: Shading, noise: float
 ) -> BatchFit:
     """Fit with few steps, to estimate the blur; `known` (E, 3) are prior mean level, contrast and blur."""
     blur = known[:, 2]
-    data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
+    data = edge_pixels(grid_image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
     data = data.weighed(np.full_like(data.root, 1 / noise))
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))

@@ -99,16 +99,23 @@ class Strips:
     u: Single  # (E, N) [px] relative to the line's middle
     v: Single  # (E, N) [px] the same
     beyond: Array  # (E,) share of the strip's pixels that lie outside the image
+    ink: Single | None = None  # (E, N) what markers add to the light [half contrasts]
 
 
 def strip_pixels(
-    image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
+    image: NDArray[np.generic],
+    lines: Lines,
+    half_width: Array,
+    trim: Array,
+    stride: int = 1,
+    ink: Single | None = None,
 ) -> Strips:
     """Gather the pixels of the strips ``|d| <= half_width`` (E,) [px] between the ends of lines.
 
     Pixels that are NaN are left out. `trim` (E, 2) [px] is the length to leave out at the two ends. Only
     every `stride`-th column is used. A strip is selected from a parallelogram of whole pixels: columns along
     the line (rows if it is more vertical than horizontal), and in each column the pixels around the line.
+    `ink` (H, W) is what markers add to the light.
     """
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
@@ -155,7 +162,8 @@ def strip_pixels(
         known = np.isfinite(value)
         inside &= known
         value[~known] = 0
-    return Strips(s, d, value, inside, u, v, 1 - used / np.maximum(total, 1))
+    of_ink = None if ink is None else ink.reshape(-1).take(place, mode="clip")
+    return Strips(s, d, value, inside, u, v, 1 - used / np.maximum(total, 1), of_ink)
 
 
 def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
@@ -202,6 +210,7 @@ class GridImage:
     image: NDArray[np.generic]
     grid: Grid
     floor: float  # [DN^2] least variance of the pixels, that of rounding
+    ink: Single | None = None  # (H, W) what markers add to the light [half contrasts]
 
     @property
     def size(self) -> tuple[int, int]:

@@ -84,7 +84,7 @@ def fit_grid_vertices(
     neighbours = [unknown[1:-1, :-2], unknown[1:-1, 2:], unknown[:-2, 1:-1], unknown[2:, 1:-1]]
     last = np.stack([which[grid_image.grid.seen] for which in neighbours], axis=1).reshape(-1, 2, 2)
     rho = correlation(blur, lines)
-    data = _vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, last)
+    data = _vertex_pixels(grid_image, lines, light, (first, second), rho, fitted.shading, last)
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
     shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
@@ -159,7 +159,7 @@ class VertexPixels(FitPixels):
 
 
 def _vertex_pixels(
-    image: NDArray[np.generic],
+    grid_image: GridImage,
     lines: tuple[Lines, Lines],
     light: Array,
     blur: tuple[Array, Array],
@@ -177,7 +177,7 @@ def _vertex_pixels(
     for k in (0, 1):
         half = np.minimum(REACH * blur[k], 0.5 * lines[k].width)
         trim = np.minimum(_LAST * blur[1 - k], _MOST_LAST * lines[k].length)[:, None] * last[:, k]
-        parts.append(strip_pixels(image, lines[k], half, trim))
+        parts.append(strip_pixels(grid_image.image, lines[k], half, trim, ink=grid_image.ink))
     u, v, value, inside = (
         np.concatenate([getattr(part, name) for part in parts], axis=1)
         for name in ("u", "v", "value", "inside")
@@ -189,6 +189,8 @@ def _vertex_pixels(
     index, inside = packed(inside, inside.sum(axis=1))
     u, v, value = (x.reshape(-1)[index] for x in (u, v, value))
     (s1, d1), (s2, d2) = (_coordinates(line, u, v) for line in lines)
+    inks = [part.ink for part in parts if part.ink is not None]
+    ink = np.concatenate(inks, axis=1).reshape(-1)[index] if inks else None
     Q = _faded(lines, (d1, d2), blur) * light.astype(np.float32)[:, None]
     value, gain = shading.off(lines[0].middle, u, v, value)
     lever1, lever2 = (
@@ -197,7 +199,9 @@ def _vertex_pixels(
     beyond = np.maximum(parts[0].beyond, parts[1].beyond)
     weight, correlation = inside.astype(np.float32), rho.astype(np.float32)[:, None]
     relative = (np.stack(blur, axis=1) / (0.5 * (blur[0] + blur[1]))[:, None]).astype(np.float32)
-    return VertexPixels(value, gain, Q, weight, beyond, lever1, d1, lever2, d2, correlation, relative)
+    return VertexPixels(
+        value, gain, Q, weight, beyond, lever1, d1, lever2, d2, correlation, relative, ink=ink
+    )
 
 
 def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], blur: tuple[Array, Array]) -> Single:
@@ -234,6 +238,8 @@ def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Line
     series, bent1, bent2 = _crossed(z1, z2, rho, density1 * density2)
     x = np.asarray((E1 * E2 + series) * data.Q, dtype=data.value.dtype)
     by_z1, by_z2 = (slope1 * E2 + bent1) * data.Q, (slope2 * E1 + bent2) * data.Q
+    if data.ink is not None:
+        x += data.ink
     F, steep = response(x, shape.nonlinearity)
     gain = data.gain * data.root
     factor = -contrast / sigma * steep * gain

@@ -1,8 +1,8 @@
-"""Take the markers off an image of a board, so that plain squares are left to be measured.
+"""What the markers on a board add to its light, so that the edges beside them are fitted as plain ones are.
 
-A marker that is read is known to the last bit, and the fit of the board says where its cells lie, how blurred
-they are and which levels they have. What they change in each pixel follows, and is taken off again around the
-marker. Pixels within it are left out.
+A marker that is read is known to the last bit, and the fit of the board says where its cells lie and how
+blurred they are. What they add to the light of each pixel around the marker follows, and is a part of the
+edges' model. Pixels within the marker, where it is most, are left out.
 
 In the coordinates (a, b) of a cell of the board, the marker is a pattern of rectangles, and the light of a
 blurred pattern is a sum over the corners of its outline,
@@ -11,7 +11,7 @@ blurred pattern is a sum over the corners of its outline,
 
 with Phi the normal distribution function, s_a and s_b the blur along the axes, rho its correlation, which
 perspective makes, and phi_n the derivatives of Phi (Mehler's series). Edges are displaced by the shift that
-the fit found for all edges, and the response F applies to the sum of pattern and squares.
+the fit found for all edges.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.fitting.edge_profile import Real, profile, response
-from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.fitting.edge_profile import Real, profile
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
-from neurocal_cli.detection.fitting.strips import Single
+from neurocal_cli.detection.fitting.strips import GridImage, Single
 
 # sigma, beyond which a pattern changes the light by less than 0.0002 half contrasts, and beyond which the
 # inner part of a marker with a border does not matter
@@ -107,9 +106,12 @@ class Appearance:
     # the correlation of both
     blur: Array
     shift: float  # [px] of edges towards the light side
-    shading: Shading
-    tails: Array  # (2,) of the profile of all edges, and ...
-    nonlinearity: Array  # ... of the response; see `edge_profile`
+    tails: Array  # (2,) of the profile of all edges; see `edge_profile`
+
+    def halfway_to(self, other: Appearance) -> Appearance:
+        """With another map, and half of the change of the rest: whole steps may overshoot."""
+        values = (0.5 * (getattr(self, name) + getattr(other, name)) for name in ("blur", "shift", "tails"))
+        return Appearance(other.map, *values)
 
     def clearance(self, ink: Ink) -> float:
         """Least width of the cells of some ink, of those that the camera sees [sigma]."""
@@ -120,18 +122,20 @@ class Appearance:
         return float(np.nanmin(width / self.blur[:, :2].max(axis=1), initial=np.inf))
 
 
-def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: float) -> NDArray[np.float32]:
-    """The image (H, W) without patterns near the edges of their cells, and NaN within the patterns.
+def with_ink(raw: GridImage, ink: Ink, look: Appearance, most: float) -> GridImage:
+    """Add to an image what patterns add to the light near the edges of their cells, and NaN within patterns.
 
     `most` is the change of the light, in half contrasts, beyond which a pixel is left out.
     """
-    result = image.astype(np.float32)
+    result = raw.image.astype(np.float32)
+    light = np.zeros(result.shape, dtype=np.float32)
+    known = replace(raw, image=result, ink=light)
     ticks = np.linspace(0, 1, _SAMPLES)  # the next cells may be of another size
     samples = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     seen = look.map.at(ink.cell[:, None] + samples)
     shown = np.asarray(np.isfinite(seen).all(axis=(1, 2)) & ink.inner.any(axis=(1, 2)))
     if not shown.any():
-        return result
+        return known
     ink, blur = ink.only(shown), look.blur[shown]
     look = replace(look, blur=blur)
     inverse = LocalInverse.of(seen[shown], samples)
@@ -140,25 +144,16 @@ def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: fl
         ink = ink.filled
     pixels, used = _near_edges(result, ink, corners, blur[:, :2].max(axis=1), len(ink.lines) == 2)
     if not used.any():
-        return result
+        return known
     a, b, *slopes = inverse.at(pixels)
     blurred = _Blurred.of(slopes, blur, look.shift, look.tails)
     change = blurred.pattern(a, b, ink.lines, ink.inner)
     u, v = pixels[used].T.astype(np.intp)
-    # Linear within a cell: a local shading takes long at so many places.
-    middle = corners.mean(axis=1)
-    _, slope = look.shading.slopes(middle)
-    contrast = look.shading.at(middle)[1][:, None] + ((pixels - middle[:, None]) @ slope[:, :, None])[..., 0]
-    change, contrast = change[used], contrast[used]
-    if look.nonlinearity.any():
-        plain = np.clip(blurred.squares(a, b, ink.base)[used], -1, 1)
-        seen_light = np.clip(plain + change, -1, 1)
-        change = response(seen_light, look.nonlinearity)[0] - response(plain, look.nonlinearity)[0]
-    # Some pixels are near the edges of two cells.
-    np.subtract.at(
-        result, (v, u), np.where(np.abs(change) > most, np.nan, contrast * change).astype(np.float32)
-    )
-    return result
+    change = change[used].astype(np.float32)
+    np.add.at(light, (v, u), change)  # some pixels are near the edges of two cells
+    left = np.abs(change) > most
+    result[v[left], u[left]] = np.nan
+    return known
 
 
 def _near_edges(
@@ -242,18 +237,6 @@ class _Blurred:
             np.tile(lines, 2) + shift[:, None] * signs for shift in (self.shift_a, self.shift_b)
         )
         return self._sum(a, b, moved_a, moved_b, _displaced(np.pad(cells, ((0, 0), (1, 1), (1, 1)))))
-
-    def squares(self, a: Array, b: Array, base: Array) -> Array:
-        """Blurred light (N, M) of the squares around the one from 0 to 1, of the colour `base` (N,)."""
-        ends = np.array([0.0, 1.0])
-        (ea, _), (eb, _) = (
-            self._profile((x[..., None] - ends) / s[..., None]) for x, s in ((a, self.a), (b, self.b))
-        )
-        corners = 4 * base[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        # Stripes along both axes, and what is different where they cross.
-        stripes = base[:, None] * (1 - (1 + ea) @ [1, -1] - (1 + eb) @ [1, -1])
-        ends = np.tile(ends, (len(a), 1))
-        return np.asarray(stripes + self._sum(a, b, ends, ends, corners))
 
     def _profile(self, z: Real) -> tuple[Real, Real]:
         """Profile of an edge and the normal density at distances in sigma."""

@@ -1,4 +1,4 @@
-"""Fit the edges of a board with markers: the ink is taken off the image, with what the last fit says of it.
+"""Fit the edges of a board with markers: their ink is in the model, with what the last fit says of it.
 
 The first look comes from profiles across the edges, which include the border of the marker beside the edge.
 """
@@ -16,7 +16,6 @@ from neurocal_cli.detection.fitting.batched_newton import LEAST_BLUR
 from neurocal_cli.detection.fitting.common_parameters import correlation
 from neurocal_cli.detection.fitting.edge_fit import usual_stride
 from neurocal_cli.detection.fitting.edge_profile import (
-    RESPONSE_TERMS,
     EdgeProfile,
     edge_profile,
     erf_and_density,
@@ -24,20 +23,20 @@ from neurocal_cli.detection.fitting.edge_profile import (
 )
 from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_again, fit_from, map_of_vertices
 from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
-from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, fit_shading, square_levels
+from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Lines, Strips, grid_lines, strip_pixels
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.markers.ink import Appearance, Ink, without_ink
+from neurocal_cli.detection.markers.ink import Appearance, Ink, with_ink
 from neurocal_cli.detection.medians import upper_median
 
-# Greatest change of the light by the ink, in half contrasts, that is taken off in the first fit, and in those
-# that repeat it with what it found. The first look is not accurate enough for more; without more, the light
-# side of blurred edges is not seen. How often the fit is repeated depends on the distance of the ink from the
-# edges [sigma].
-_FIRST_MOST = 0.1
+# Greatest change of the light by the ink, in half contrasts, of pixels that are used in the first fit, and in
+# those that repeat it with what it found; how often depends on how far the ink is from the edges [sigma].
+# Without pixels in the ink, the light side of blurred edges is not seen, and their levels are wrong by up to
+# a tenth; the first look is not accurate enough for all pixels.
+_FIRST_MOST = 0.5
 _MOST: tuple[tuple[float, tuple[float, ...]], ...] = ((7.0, ()), (5.0, (0.5,)))
-_MOST_NEAR = (0.1, 0.5)
+_MOST_NEAR = (0.5, 1.0, 1.0)
 _OFFSET_SIGMA = 0.05  # px, of an edge's offset from its profile
 _SIGMAS = np.geomspace(0.4, 6.0, 12)  # px, tried first
 _OFFSETS = np.linspace(-1.0, 1.0, 9)  # px, of an edge from the found vertices
@@ -49,25 +48,24 @@ _TINY = 1e-9  # least variance of the samples of a profile
 _ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
 
 
-def fit_without_ink(
+def fit_with_ink(
     image: NDArray[np.generic], grid: Grid, floor: float, ink: Ink, undo: bool = True
 ) -> GridFit:
     """Fit a board whose cells have patterns, after sharpening by the camera is undone if `undo`."""
     raw, ink = GridImage(image, grid, floor), ink.beside(grid.seen)
-    look, mapped, levels, noise = _first_look(raw, ink)
+    look, mapped, levels, noise, shading = _first_look(raw, ink)
     sharpening = find_sharpening(_plain_profile(raw, mapped, _gaps(raw, ink), *levels)) if undo else None
     if sharpening is not None:
         undone = sharpening.undone(image, raw.pixels, 2 * grid.square)
-        return fit_without_ink(undone, grid, floor * float((sharpening.inverse**2).sum()), ink, undo=False)
-    plain = GridImage(without_ink(image, ink, look, _FIRST_MOST), grid, floor)
+        return fit_with_ink(undone, grid, floor * float((sharpening.inverse**2).sum()), ink, undo=False)
     sigma = upper_median(look.blur[:, 0])
-    fitted = fit_from(plain, mapped, sigma, look.shading, levels, max(noise, floor))
+    inked = with_ink(raw, ink, look, _FIRST_MOST)
+    fitted = fit_from(inked, mapped, sigma, shading, levels, max(noise, floor))
     look = _look_of(fitted, ink)
     gap = ink.gap * look.clearance(ink)
     for most in next((all_of for limit, all_of in _MOST if gap > limit), _MOST_NEAR):
-        plain = GridImage(without_ink(image, ink, look, most), grid, floor)
-        fitted = fit_again(plain, fitted)
-        look = _look_of(fitted, ink)
+        fitted = fit_again(with_ink(raw, ink, look, most), fitted)
+        look = look.halfway_to(_look_of(fitted, ink))
     return fitted
 
 
@@ -77,15 +75,13 @@ def _look_of(fitted: GridFit, ink: Ink) -> Appearance:
     lines = _crossing(at, ink)
     (along_a, _), (along_b, _) = (blur.at(line) for line in lines)
     spread = np.stack([along_a, along_b, correlation(blur, lines)], axis=-1)
-    shape = fitted.fit.shape
-    tails = shape.tails.mean(axis=0)
-    return Appearance(at, spread, float(fitted.map.shift[0]), fitted.shading, tails, shape.nonlinearity)
+    return Appearance(at, spread, float(fitted.map.shift[0]), fitted.fit.shape.tails.mean(axis=0))
 
 
-def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Array, Array], float]:
+def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Array, Array], float, Shading]:
     """How the board looks by the found vertices and by profiles across the edges between them.
 
-    Returns also the map of the edges, their mean levels and half contrasts, and the noise [DN^2].
+    Returns also the map of the edges, their mean levels and half contrasts, noise [DN^2], and shading.
     """
     found = map_of_vertices(raw)
     noise = _noise(raw, found.map)
@@ -107,8 +103,8 @@ def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Arr
     crossing, ones = _crossing(found.map, ink), np.ones(len(ink.cell))
     rho = (crossing[0].normal * crossing[1].normal).sum(axis=1)
     blur = np.stack([sigma * ones, sigma * ones, rho], axis=-1)
-    look = Appearance(found.map, blur, float(found.shift[0]), shading, np.zeros(2), np.zeros(RESPONSE_TERMS))
-    return look, found, (mean, contrast), noise
+    look = Appearance(found.map, blur, float(found.shift[0]), np.zeros(2))
+    return look, found, (mean, contrast), noise, shading
 
 
 def _noise(raw: GridImage, at: SmoothMap) -> float:
@@ -145,9 +141,12 @@ def _profiles(
     for part in _ALONG:
         middle = lines.middle + (part * lines.length)[:, None] * lines.tangent
         seen += interpolate(image, middle[:, None] + d[..., None] * lines.normal[:, None]) / len(_ALONG)
-    least, best, offset_of = np.full(len(d), np.inf), np.zeros((len(d), 3)), np.zeros(len(d))
     total, square = seen.sum(axis=1), (seen**2).sum(axis=1)
-    for sigma, offset in product(sigmas.tolist(), offsets.tolist()):
+    costs, values = (
+        np.empty((len(sigmas), len(offsets), len(d))),
+        np.empty((len(sigmas), len(offsets), len(d), 2)),
+    )
+    for (k, sigma), (j, offset) in product(enumerate(sigmas.tolist()), enumerate(offsets.tolist())):
         beyond = (side[:, None] * (d - offset) - gap[:, None]) / sigma
         x = erf_and_density((d - offset) / sigma)[0]
         x -= (side * near)[:, None] * (1 + erf_and_density(beyond)[0])
@@ -157,10 +156,17 @@ def _profiles(
         contrast /= np.maximum(_PLACES * (x**2).sum(axis=1) - sum_x**2, _TINY)
         mean = (total - contrast * sum_x) / _PLACES
         cost = square - mean * total - contrast * product_x
-        better = (cost < least) & (contrast > 0)
-        least[better], offset_of[better] = cost[better], offset
-        best[better] = np.column_stack([mean, contrast, np.full(len(d), sigma)])[better]
-    return best, offset_of
+        costs[k, j] = np.where(contrast > 0, cost, np.inf)
+        values[k, j] = np.stack([mean, contrast], axis=-1)
+    every = np.arange(len(d))
+    k, j = np.divmod(costs.reshape(-1, len(d)).argmin(axis=0), len(offsets))
+    # The least of the parabola through the costs of three offsets.
+    before, here, after = (costs[k, np.clip(j + step, 0, len(offsets) - 1), every] for step in (-1, 0, 1))
+    bend = before - 2 * here + after
+    inner = np.isfinite(bend) & (bend > 0) & (j > 0) & (j < len(offsets) - 1)
+    part = 0.5 * np.divide(before - after, bend, out=np.zeros(len(d)), where=inner)
+    found = offsets[j] + part * (offsets[1] - offsets[0])
+    return np.column_stack([values[k, j, every], sigmas[k]]), found
 
 
 def _plain_profile(
