@@ -18,7 +18,7 @@ A format is added in the module of its relatives by one `table`, and by its name
     )
 
 A program whose numbers have an order in place of keys has `in_order` in its `parts`. There, too, is all that
-a file says in other words: a ratio of focal lengths, a principal point from the middle of the image.
+a file says in other words, such as a principal point from the middle of the image.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def table(
     unit: str | None = "m",
     project: bool = False,
     write: Callable[[Any], str] | None = None,
-    whole: Callable[[list[Tree], CameraSet], Any] = lambda trees, cameras: trees[0],
+    whole: Callable[[list[Tree], CameraSet], Any] | None = None,
     **properties: Any,
 ) -> Format:
     """A format that is read, and perhaps written, by its tables.
@@ -146,7 +146,8 @@ def table(
     project : bool
         Whether the cameras of a file have no pose between them: one is read, or that which all are alike.
     write, whole : callable, optional
-        How a tree becomes a text, and the trees of cameras one of a file.
+        How a tree becomes a text, and the trees of cameras one of a file. A format without `whole` is written
+        with one camera.
     properties
         Other attributes of `Format`.
     """
@@ -170,10 +171,10 @@ def table(
     def text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         assert write is not None
         trees = [keys.tree(camera) for camera in cameras.cameras]
-        if isinstance(pose, PoseKeys) and properties.get("most_cameras", 2) > 1:
+        if isinstance(pose, PoseKeys) and made["most_cameras"] > 1:
             for tree, placed in zip(trees, cameras.mounted, strict=True):
                 pose.put(tree, placed)
-        return {"": write(whole(trees, cameras))}
+        return {"": write(trees[0] if whole is None else whole(trees, cameras))}
 
     wanted = set(matches.split()) if isinstance(matches, str) else set()
     found = {
@@ -182,9 +183,10 @@ def table(
         "skew": bool(keys.skew),
         "first_pixel": keys.first_pixel,
     }
-    made = {"read": read, **({} if write is None else {"text": text}), **found, **properties}
+    made: dict[str, Any] = {"read": read, **({} if write is None else {"text": text}), **found}
+    made |= {"most_cameras": 2 if getattr(pose, "from_first", False) else 1, **properties}
     told = (lambda document: wanted <= set(document.tree)) if isinstance(matches, str) else matches
-    return Format(keys.program, matches=told, files=files, **{**made, **properties})
+    return Format(keys.program, matches=told, files=files, **made)
 
 
 def only(cameras: Sequence[Camera], names: Mapping[str, Any], program: str) -> CameraSet:

@@ -82,7 +82,6 @@ STELLA = table(
     ),
     "OpenVSLAM, stella_vslam: YAML",
     parts=_orb_parts,
-    most_cameras=1,
 )
 
 # VINS and camodocal. Their Kannala-Brandt is r = theta + k2 theta^3 + ..., so its k2 is our k1.
@@ -114,7 +113,6 @@ VINS = table(
     "model_type projection_parameters",
     "VINS-Mono, VINS-Fusion, camodocal: YAML",
     write=_storage,
-    most_cameras=1,
 )
 
 # EuRoC's sensor.yaml: T_BS maps the camera to the body.
@@ -146,7 +144,6 @@ EUROC = table(
     parts=_euroc_parts,
     pose=PoseKeys(("T_BS",), back=True),
     write=yaml_text,
-    most_cameras=1,
     needs_size=True,
     rig="two files, `T_BS` from each camera to the body (read)",
 )

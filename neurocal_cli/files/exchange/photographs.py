@@ -101,7 +101,6 @@ NERFSTUDIO = table(
     write=json_text,
     whole=_with_frames,
     poses=True,
-    most_cameras=1,
     needs_size=True,
 )
 
@@ -170,7 +169,6 @@ GYROFLOW = table(
     parts=_gyroflow_parts,
     write=json_text,
     whole=_profile,
-    most_cameras=1,
     needs_size=True,
 )
 
@@ -242,6 +240,5 @@ OPEN3D = table(
     pose=PoseKeys(("extrinsic:columns",), frame="world"),
     unit=None,
     write=json_text,
-    most_cameras=1,
     needs_size=True,
 )

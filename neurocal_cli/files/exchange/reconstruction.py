@@ -102,7 +102,6 @@ METASHAPE = table(
     parts=_metashape_parts,
     project=True,
     write=_agisoft,
-    most_cameras=1,
     needs_size=True,
 )
 
@@ -288,5 +287,4 @@ PIX4D = table(
     "calibrated_camera_parameters.txt",
     read=_read_pix4d,
     poses=True,
-    most_cameras=1,
 )
