@@ -137,7 +137,7 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
     if not singular and relative_std < limit:
         return
     if boards:
-        _check_tilts(views, (state.R @ views.basis)[:, :, 2], singular)
+        _check_tilts(problem, (state.R @ views.basis)[:, :, 2], singular)
     more = f", or give known parameters ({ways})" if (ways := _givable(problem)) else ""
     if singular and problem.free_distortion:
         model = problem.distortion.model
@@ -182,9 +182,9 @@ def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance)
     return largest
 
 
-def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
+def _check_tilts(problem: Problem, normals: Array, singular: bool) -> None:
     """Refuse flat boards that are parallel to the image or to each other."""
-    if views.n_views == 1:
+    if problem.views.n_views == 1:
         raise DegenerateGeometryError(
             "one view of a board that is (nearly) parallel to the image cannot determine the focal length; "
             "tilt the board by 20 to 50 degrees"
@@ -196,9 +196,11 @@ def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
     found = "parallel within the noise"
     if angle < _NEARLY_PARALLEL:
         found = f"all parallel (within {angle:.1f} degrees)"
+    # Noise that leaves theta open may still determine the rest.
+    right_angles = ", or give --no-skew if it was" if problem.free[1] else ""
     raise DegenerateGeometryError(
-        f"the {views.n_views} boards are {found}, so they cannot determine the focal length; "
-        "tilt the board by 20 to 50 degrees in different directions"
+        f"the {problem.views.n_views} boards are {found}, so they cannot determine the focal length; "
+        f"tilt the board by 20 to 50 degrees in different directions{right_angles}"
     )
 
 
