@@ -260,7 +260,7 @@ def _lens_warnings(solution: Solution) -> Iterator[str]:
 def _view_warnings(solution: Solution) -> Iterator[str]:
     """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
     points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
-    if not (repeated.none or are_normalised(points)):
+    if not (repeated.none or are_normalised(points.pixels)):
         yield (
             f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
             "views that repeat a pose count as one"

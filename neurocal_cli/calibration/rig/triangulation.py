@@ -7,7 +7,7 @@ point for Gaussian noise.
 shortest segment between both rays. Both use undistorted pixels (Hartley and Sturm 1997).
 
 `fault_of_matches` tells what is wrong with matches that do not fit a rig: it undoes the common mistakes, one
-at a time, until they fit.
+at a time. The likeliest is told by the rule and the level of all causes, if most matches then fit.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.two_view_points import PointBatch, WidePointBatch
+from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, log_odds
+from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, check_choice
@@ -37,11 +39,8 @@ METHODS = get_args(Method)
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
 _FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
-_FIT = 0.8  # least share of the matches that fit once the mistake is undone
-_FEWEST = 5  # matches; fewer may fit by chance
-_NORMALISED = 2.0  # normalised coordinates are smaller, pixels larger
 
-_Try = tuple[str, tuple[Camera, Camera], Pose, Array, Array]
+_Try = tuple[tuple[Camera, Camera], Pose, Array, Array]
 
 
 @frozen_dataclass(eq=False)
@@ -194,36 +193,51 @@ def fault_of_matches(rig: StereoRig, left: Array, right: Array, limit: float) ->
 
     `limit` is the largest epipolar error [px] of a match that fits. "" if no known mistake explains them.
     """
-    if len(left) < _FEWEST:
-        return ""
-    if max(np.abs(left).max(), np.abs(right).max()) < _NORMALISED:
+    if are_normalised(np.concatenate([left, right])):
         return "the numbers are normalised coordinates, not pixels; give pixels of the original images"
-    for what, cameras, pose, a, b in _tries(rig, left, right):
-        found = triangulate(*cameras, pose, a, b)
-        if (~found.behind & ~found.off(limit)).mean() >= _FIT:
-            return what
+    sigma, errors = limit / _EPIPOLAR_SIGMAS, dict[str, Array]()
+    for what, tried in (
+        ("", ((rig.left.camera, rig.right.camera), rig.pose, left, right)),
+        *_tries(rig, left, right),
+    ):
+        (first, second), pose, a, b = tried
+        found = triangulate(first, second, pose, a, b)
+        errors[what] = np.where(found.behind, np.inf, found.epipolar)
     rectified = rectify(rig)
     if rectified is not None:
         across = 1 if rectified.P2[0, 3] != 0 else 0
-        if median(np.abs(left - right)[:, across]) <= limit:
-            return "the pixels are those of rectified images; give pixels of the original images"
-    return ""
+        what = "the pixels are those of rectified images; give pixels of the original images"
+        errors[what] = np.abs(left - right)[:, across]
+    # Matches that are wrong in addition count little: the mean of the logarithms.
+    largest = np.ptp(np.concatenate([left, right]))
+    squares = {
+        what: float(np.exp(np.log(np.fmin(error, largest) ** 2 + sigma**2).mean()))
+        for what, error in errors.items()
+    }
+    n, choices = len(left), len(errors) - 1
+    odds = {
+        what: log_odds(squares[""], squares[what], n, choices=choices)
+        for what, error in errors.items()
+        if what and (error <= limit).mean() > EXPLAINED
+    }
+    best = max(odds.values(), default=0.0)
+    return next((what for what, one in odds.items() if one > max(LEVEL, best - LEVEL)), "")
 
 
-def _tries(rig: StereoRig, left: Array, right: Array) -> Iterator[_Try]:
+def _tries(rig: StereoRig, left: Array, right: Array) -> Iterator[tuple[str, _Try]]:
     """Each mistake with what to do, and the cameras, the rig and the pixels without it."""
     cameras, pose = (rig.left.camera, rig.right.camera), rig.pose
     sides = "the left and the right pixels are exchanged; give uL,vL of the left camera"
-    yield sides, cameras, pose, right, left
+    yield sides, (cameras, pose, right, left)
     u_v = "u and v are exchanged; name the columns in their order"
-    yield u_v, cameras, pose, left[:, ::-1], right[:, ::-1]
+    yield u_v, (cameras, pose, left[:, ::-1], right[:, ::-1])
     for size, factor in (("half", 2.0), ("twice", 0.5)):
         resized = f"the pixels are of images of {size} the size; give pixels of images of the calibrated size"
-        yield resized, cameras, pose, factor * (left + 0.5) - 0.5, factor * (right + 0.5) - 0.5
+        yield resized, (cameras, pose, factor * (left + 0.5) - 0.5, factor * (right + 0.5) - 0.5)
     if any(not camera.distortion.is_identity for camera in cameras):
         first, second = (replace(camera, distortion=Distortion()) for camera in cameras)
         undistorted = "the pixels are undistorted already; give pixels of the original images"
-        yield undistorted, (first, second), pose, left, right
+        yield undistorted, ((first, second), pose, left, right)
     R, t = pose.R, pose.t
     others = {
         "their inverse does": Pose(R.T, -R.T @ t),
@@ -232,4 +246,4 @@ def _tries(rig: StereoRig, left: Array, right: Array) -> Iterator[_Try]:
     }
     for how, other in others.items():
         turned = f"R and t of the rig do not map the left camera to the right one, but {how}; correct the rig"
-        yield turned, cameras, other, left, right
+        yield turned, (cameras, other, left, right)

@@ -68,11 +68,19 @@ SHARE = Limit(0.01, 0.05)
 CONTRADICTION = Limit(1.6, 2.3)
 """Limits of an rms error over that of parts fitted by themselves: views, or the cameras of a rig."""
 HELD_OUT = Limit(1.3, 2.0)
-"""Limits of the cross-validation error over the error on all data."""
+"""Limits of an error over that of data that agree: the cross-validation error over the error on all data."""
 ELSEWHERE = Limit(1.5, 4.0)
 """Limits of the error at other points over that at the own ones: see test_given_points.py."""
 CORRELATED = Limit(0.5, 0.85)
 """Limits of the correlation of neighbouring residuals, from which on they are no measurement noise."""
+
+
+def log_odds(before: float, after: float, n: float, unknowns: float = 0.0, choices: float = 1.0) -> float:
+    """Log odds of a cause that lowers the squared error of n equations from one value to another.
+
+    The noise is what it leaves, and the prior of each of its unknowns is worth one equation (Schwarz 1978).
+    """
+    return 0.5 * (n * float(np.log(before / after)) - unknowns * float(np.log(n))) - float(np.log(choices))
 
 
 def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:

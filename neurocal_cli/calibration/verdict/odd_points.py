@@ -60,14 +60,14 @@ def odd_points(calibration: Calibration, explained: bool) -> Iterator[Finding]:
     yield from views_of_another_scale(calibration.points)
 
 
-def are_normalised(points: Correspondences) -> bool:
-    """Whether the pixels are normalised coordinates."""
-    return bool(np.abs(points.pixels).max() < _NORMALISED)
+def are_normalised(pixels: Array) -> bool:
+    """Whether pixels (N, 2) are normalised coordinates."""
+    return bool(np.abs(pixels).max() < _NORMALISED)
 
 
 def odd_pixels(points: Correspondences) -> Iterator[Finding]:
     """Findings about the pixels as numbers."""
-    if are_normalised(points):
+    if are_normalised(points.pixels):
         yield (
             2,
             "all u,v lie between -2 and 2: they are normalised coordinates, not pixels",

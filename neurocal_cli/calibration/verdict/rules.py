@@ -86,7 +86,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
-    if are_normalised(calibration.points):  # the other rules are in pixels
+    if are_normalised(calibration.points.pixels):  # the other rules are in pixels
         yield from odd_pixels(calibration.points)
         return
     axes = evidence.proportions

@@ -147,8 +147,8 @@ def odd_view(told: Told) -> Said:
     moved, reason = told.found.amounts * told.alpha, f"{told.members[0]}: it fits another camera or crop"
     if np.abs(told.found.amounts).max() < _LINEAR:
         reason += (
-            f": its focal length is {moved[0]:+.2g} px and its centre ({moved[2]:+.2g}, {moved[3]:+.2g}) px "
-            "from that of the others"
+            f": its focal length is {moved[0]:+.2g} px and its centre ({moved[-2]:+.2g}, {moved[-1]:+.2g}) "
+            "px from that of the others"
         )
     return reason, told.displaced / told.diagonal
 

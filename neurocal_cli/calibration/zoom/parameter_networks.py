@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds
 from neurocal_cli.calibration.zoom.mlfn import (
     Schedule,
     Topology,
@@ -58,11 +59,6 @@ _LEAST_FREEDOM, _ENOUGH_FREEDOM = 2.0, 4.0
 _SMOOTH = 3  # weights for each control of a smooth parameter
 
 _TAU2 = 1e-8 * 10 ** np.arange(0.0, 9.0, 0.125)
-
-# Limit of a deletion residual with many degrees of freedom, and how it grows with few: none of 120 good
-# tables exceeds it. Repeated by the same test.
-_ODD, _ODD_GROWTH = 6.0, 10.0
-
 
 SCALES = ("log", "linear", "inverse")
 # Two slow tests of test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
@@ -356,19 +352,20 @@ def error_variances(members: Sequence[LensNets], x: Array, outputs: Array) -> Ar
 
 
 def odd_camera(members: Sequence[LensNets], x: Array, outputs: Array) -> int | None:
-    """The camera whose deletion makes all others agree far better, or None; see `error_variances`."""
+    """The camera without which the others agree far more probably, or None; see `error_variances`."""
     S = len(x)
     if too_few(S, x.shape[1]):
         return None
     variance, freedom = _errors(members, x, outputs)
-    excess = np.zeros(S)
+    evidence = np.zeros(S)
     for s in range(S):
         rest = np.arange(S) != s
         without, left = _errors(members, x[rest], outputs[rest])
-        squares = (freedom * variance - left * without) / without
-        excess[s] = np.median(np.sqrt(np.maximum(squares, 0)) / (1 + _ODD_GROWTH / left**2), axis=0).max()
-    worst = int(excess.argmax())
-    return worst if excess[worst] > _ODD else None
+        squares = np.median([freedom * variance, left * without, left], axis=1)  # (3, L)
+        of_nets = (log_odds(max(b, a), a, nu + 1, 1, outputs.size) for b, a, nu in squares.T.tolist())
+        evidence[s] = max(of_nets)
+    worst = int(evidence.argmax())
+    return worst if evidence[worst] > LEVEL else None
 
 
 def _errors(members: Sequence[LensNets], x: Array, outputs: Array) -> tuple[Array, Array]:

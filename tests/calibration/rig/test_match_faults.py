@@ -88,11 +88,11 @@ def test_a_rig_in_another_convention_is_named(what: str, wrong: Callable[[Array,
     assert what in fault_of_matches(made(wrong(R, t)), *matches(), LIMIT)
 
 
-def test_shuffled_and_few_matches_have_no_such_mistake() -> None:
+def test_shuffled_matches_and_a_single_one_have_no_such_mistake() -> None:
     left, right = matches()
     shuffled = right[np.random.default_rng(1).permutation(len(right))]
     assert fault_of_matches(made(), left, shuffled, LIMIT) == ""
-    assert fault_of_matches(made(), right[:3], left[:3], LIMIT) == ""
+    assert fault_of_matches(made(), right[:1], left[:1], LIMIT) == ""
 
 
 def test_the_command_names_it(tmp_path: Path) -> None:
