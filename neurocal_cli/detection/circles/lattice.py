@@ -206,8 +206,9 @@ _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
 # Amplitudes of two and of four periods: at most 0.15 and 0.02 of circles of 6 px and more, blurred by up to
 # 3 px and tilted by up to 65 degrees, and of those moved by half of their radius.
-_LOPSIDED = 0.16, 0.035
+_LOPSIDED = 0.16, 0.035, np.inf
 _RINGS = np.append(np.linspace(0.3, 1.4, 23), 1.5)  # of the radius, where the light is looked at
+_INSIDE = 2  # the ring of 0.4, within all marks
 _SYMMETRIC = (
     "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
@@ -447,11 +448,12 @@ def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
     return float((axis[0] + 1e-3 * axis[1]) / np.hypot(*axis))
 
 
-def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tuple[float, float]) -> bool:
+def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tuple[float, ...]) -> bool:
     """Whether marks at places (N, 2) of a board are no circles, by the light around their centres.
 
     Of the light over their contrast, at the distance where it is half-way in the mean, by the angle on the
     board: long marks have an amplitude of two periods, and squares of four, larger than the `most` of either.
+    The third limit is that of the light's spread within most marks, beyond that around them: keys have signs.
     """
     flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
     steps = predicted(places, places, centre, flattening)[1]
@@ -460,11 +462,14 @@ def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tupl
     ring = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     levels = interpolate(light, centre[:, None] + _RINGS[:, None, None, None] * (ring @ steps))
     contrast = np.ptp(np.median(levels, axis=2), axis=0)
-    relative = (levels / np.maximum(contrast, 1.0)[:, None]).mean(axis=1)
+    levels /= np.maximum(contrast, 1.0)[:, None]
+    inside, around = (float(np.median(levels[k].std(axis=1))) for k in (_INSIDE, -1))
+    relative = levels.mean(axis=1)
     mean, within = relative.mean(axis=1), np.count_nonzero(_RINGS < 1)
     # A ring may be light in its middle.
     inner = np.abs(mean[:within] - mean[-1]).argmax()
     outer = within + np.abs(mean[within:] - mean[inner]).argmax()
     half = np.abs(mean[inner : outer + 1] - 0.5 * (mean[inner] + mean[outer])).argmin()
-    amplitudes = (np.abs((relative[inner + half] * np.exp(1j * n * angle)).mean()) for n in (2, 4))
-    return any(one > limit for one, limit in zip(amplitudes, most, strict=True))
+    amplitudes = [float(np.abs((relative[inner + half] * np.exp(1j * n * angle)).mean())) for n in (2, 4)]
+    spread = float(np.sqrt(max(inside**2 - around**2, 0.0)))
+    return any(one > limit for one, limit in zip((*amplitudes, spread), most, strict=True))
