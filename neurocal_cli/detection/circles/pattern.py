@@ -28,7 +28,7 @@ _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
 _LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses no rows of smaller ones
 _BENT = 0.1  # greatest median of the second differences of centres, over the step
-# The second is at most 0.01 for circles, and 0.015 and more for squares of 8 px (6 px if sharp); the third is at
+# The second is at most 0.01 for circles, and 0.015 and more for squares of 8 px (6 px if sharp); the third at
 # most 0.08 for circles, and 0.15 for signs on keys.
 _LOPSIDED = 0.06, 0.012, 0.11
 # Images that show the same full pattern without what is around it, and their least share.
