@@ -30,7 +30,7 @@ from neurocal_cli.calibration.rig.frames import refuse_apart
 from neurocal_cli.calibration.rig.motion import timed
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.refinement import adjusted
-from neurocal_cli.calibration.verdict.findings import LEVEL
+from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds
 from neurocal_cli.camera.geometry import Array, median, rotation_vector
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
@@ -98,7 +98,7 @@ def with_delays(fit: RigFit, times: Sequence[Array] | None, names: Sequence[str]
     for stated in ([times] if times is not None else []) + ([None] if late else []):
         trial = timed(fit, stated)
         if trial is not None:
-            evidence = log_evidence(squares, scatter(trial)[0], degrees, len(names) - 1)
+            evidence = _evidence(squares, scatter(trial)[0], degrees, len(names) - 1)
             if evidence > most:
                 best, most = trial, evidence
     return best
@@ -194,14 +194,14 @@ def is_common(found: Named, still: RigFit, fit: RigFit, n: int) -> bool:
     if found.cause in TWO_GEOMETRIES:
         own = scatter(_by_itself(still.problem, fit, found))[0]
         choices = float(np.log(still.problem.together.sum() * len(still.problem.cameras)))
-        evidence = log_evidence(squares, rest + own, degrees, int(of_rig(still).sum())) - choices
-    return evidence > log_evidence(squares, rest, degrees, 6 * n)
+        evidence = _evidence(squares, rest + own, degrees, int(of_rig(still).sum())) - choices
+    return evidence > _evidence(squares, rest, degrees, 6 * n)
 
 
-def log_evidence(before: float, after: float, degrees: int, m: int) -> float:
+def _evidence(before: float, after: float, degrees: int, m: int) -> float:
     """Log odds of m unknowns that were fitted, and lower the squares from one value to another."""
     without, with_them = max(before / degrees, 1.0), max(after / max(degrees - m, 1), 1.0)
-    return float(0.5 * degrees * np.log(without / with_them) - 0.5 * m * np.log(degrees))
+    return log_odds(without, with_them, degrees, m)
 
 
 def seen_again(problem: RigProblem, fit: RigFit, found: Named) -> Named:
