@@ -33,10 +33,10 @@ so it can be undone without a loss, and without amplifying the noise: the image 
 camera without sharpening, whose noise is nearly white again. `find_sharpening` fits k and r to the mean
 profile of all edges,
 
-    m + S [a E + b phi + c sign(z) phi],   E = erf(z / sqrt 2),
+    m + S [a E + b phi],   E = erf(z / sqrt 2),
 
-with phi the normal density. The terms b and c describe a shift of the edges, c if their one side is the
-reflection of the other.
+with phi the normal density. The term b describes a shift of the edges; it is b sign(z) phi if one side of
+them is the reflection of the other.
 """
 
 from __future__ import annotations
@@ -260,6 +260,7 @@ class EdgeProfile:
     d: Array  # (B,) [px] distance from the edge towards the light side
     light: Array  # (B,) -1 at the dark level and +1 at the light level of the edges
     count: Array  # (B,) number of pixels
+    reflected: bool = False  # whether one side of the edges is the reflection of the other
 
 
 def edge_profile(strips: Strips, offset: Array, mean: Array, contrast: Array) -> EdgeProfile | None:
@@ -349,11 +350,11 @@ def _left(profile: EdgeProfile, sigma: Array, radius: Array, amount: Array) -> t
         (fine[..., None, :] + k * (fine - smooth)[..., None, :])
         for fine, smooth in ((E, E_wide), (density, density_wide))
     )
-    at = np.stack([np.ones_like(step), step, bump, np.sign(d) * bump], axis=-1)
+    at = np.stack([np.ones_like(step), step, np.sign(d) * bump if profile.reflected else bump], axis=-1)
     root = np.sqrt(profile.count / profile.count.max())
     rows, wanted = at * root[:, None], root * profile.light
     normal = rows.swapaxes(-1, -2) @ rows
-    solution = np.linalg.solve(normal + _RIDGE * np.eye(4), (wanted @ rows)[..., None])
+    solution = np.linalg.solve(normal + _RIDGE * np.eye(3), (wanted @ rows)[..., None])
     rest = ((rows @ solution)[..., 0] - wanted) ** 2
     above = (at[..., 1:] @ solution[..., 1:, :])[..., 0]
     height = np.maximum(solution[..., 1, 0], 1e-9)

@@ -5,6 +5,7 @@ The first look comes from profiles across the edges, which include the border of
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -193,7 +194,8 @@ def _plain_profile(
     )
     both = (np.concatenate([one, one], axis=1) for one in (strips.s, strips.u, strips.v))
     s, u, v = both
-    return edge_profile(Strips(s, d, value, inside, u, v, strips.beyond), offset, mean, contrast)
+    found = edge_profile(Strips(s, d, value, inside, u, v, strips.beyond), offset, mean, contrast)
+    return None if found is None else replace(found, reflected=True)
 
 
 def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array]:
