@@ -16,7 +16,7 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.lattice import Placed, corners_of_tags, find_vertices, place
-from neurocal_cli.detection.markers.reading import USUAL, Marks, codes_in, read_markers
+from neurocal_cli.detection.markers.reading import USUAL, Marks, codes_in, read_codes, read_markers
 from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
@@ -172,12 +172,17 @@ def _reason(board: Board, grey: NDArray[np.uint8], read: int, quadrangles: Seque
         )
     named = {plane.markers.dictionary for plane in board.planes if plane.markers is not None} - {""}
     tags = next((plane for plane in board.planes if isinstance(plane, TagPlane)), None)
-    for marks, border in _codes(grey, quadrangles) if named else ():
-        if any(_codes_alike(marks.dictionary, one) for one in named):
-            if tags is not None and border != tags.border and len(marks) >= _ENOUGH:
+    seen = list(_codes(grey, quadrangles)) if named else []
+    own = [one for one in seen if any(_codes_alike(one[0].dictionary, name) for name in named)]
+    if tags is not None and any(len(marks) >= _ENOUGH for marks, _ in own):
+        # The quadrangles are those of tags with the border that is described.
+        own += [one for one in read_codes(grey)[0] if _codes_alike(one[0].dictionary, own[0][0].dictionary)]
+        for marks, border in own:
+            if border != tags.border and len(marks) >= _ENOUGH:
                 cells = "a border of one cell" if border == 1 else "a border of two cells"
                 return f"the tags have {cells}; say border: {border} in a board file"
-        elif len(marks) >= _STRANGE:
+    for marks, _ in seen:
+        if not any(_codes_alike(marks.dictionary, one) for one in named) and len(marks) >= _STRANGE:
             return (
                 f"the image shows markers of {marks.dictionary} instead of {' and '.join(sorted(named))}; "
                 "correct the dictionary of the board"
