@@ -189,7 +189,8 @@ def _best(
 ) -> tuple[str, AbstractSet[str]]:
     """The model with the lowest criterion among those tied for the lowest cross-validation error.
 
-    The second result is all models that no other one predicts decidedly better than.
+    The second result is all models that no other one predicts decidedly better than, or is decidedly more
+    probable than.
 
     Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
     models, but among many models one is the best by chance. The least penalty does not count here: where the
@@ -211,12 +212,6 @@ def _best(
         or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, FAR_BETTER) for c in few.values())
     }
     best = min(pool, key=lambda name: pool[name].held_out)
-    good = {
-        name
-        for name, candidate in eligible.items()
-        if np.isfinite(candidate.lost).all()
-        and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
-    }
     tied = []
     for name, candidate in pool.items():
         excess = _by_fold(candidate.lost - pool[best].lost, repeated)
@@ -224,7 +219,15 @@ def _best(
         simpler = candidate.coefficients < pool[best].coefficients
         if excess.sum() <= max(2 * _TIE * pool[best].held_out, chance if simpler else 0.0):
             tied.append(name)
-    return min(tied, key=lambda name: criterion[name]), good
+    chosen = min(tied, key=lambda name: criterion[name])
+    good = {
+        name
+        for name, candidate in eligible.items()
+        if np.isfinite(candidate.lost).all()
+        and candidate.criterion(n) < criterion[chosen] + DECISIVE
+        and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
+    }
+    return chosen, good
 
 
 def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate]:

@@ -136,6 +136,12 @@ def test_only_models_that_would_be_taken_change_anything_when_they_are_preferred
     assert np.array_equal(chosen(scene, 4, preferred="k1k2").K, found.K)
 
 
+def test_a_preferred_lens_that_is_far_less_probable_is_not_taken() -> None:
+    """A camera of a rig has the lens of the others only where that leaves no errors of its own."""
+    scene, _ = bent_set("k1k2", 43)
+    assert chosen(scene, 43, preferred="k1").distortion_model == "k1k2"
+
+
 def test_too_few_points_for_a_lens_leave_none() -> None:
     scene = table_1()
     few = scene.points(0.1, np.random.default_rng(0)).select(np.arange(0, 440, 55))
