@@ -189,8 +189,8 @@ def _best(
 ) -> tuple[str, AbstractSet[str]]:
     """The model with the lowest criterion among those tied for the lowest cross-validation error.
 
-    The second result is all models that no other one predicts decidedly better than, or is decidedly more
-    probable than.
+    The second result is all models that no other one predicts decidedly better than, without simpler ones that
+    are far less probable.
 
     Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
     models, but among many models one is the best by chance. The least penalty does not count here: where the
@@ -220,11 +220,12 @@ def _best(
         if excess.sum() <= max(2 * _TIE * pool[best].held_out, chance if simpler else 0.0):
             tied.append(name)
     chosen = min(tied, key=lambda name: criterion[name])
+    enough = pool[chosen].coefficients
     good = {
         name
         for name, candidate in eligible.items()
         if np.isfinite(candidate.lost).all()
-        and candidate.criterion(n) < criterion[chosen] + DECISIVE
+        and (candidate.coefficients > enough or candidate.criterion(n) < criterion[chosen] + DECISIVE)
         and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
     }
     return chosen, good
