@@ -189,8 +189,8 @@ def _best(
 ) -> tuple[str, AbstractSet[str]]:
     """The model with the lowest criterion among those tied for the lowest cross-validation error.
 
-    The second result is all models that no other one predicts decidedly better than, without simpler ones that
-    are far less probable.
+    The second result is all models that no other one predicts decidedly better than, without simpler ones
+    that are far less probable.
 
     Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
     models, but among many models one is the best by chance. The least penalty does not count here: where the
