@@ -27,6 +27,8 @@ _LEAST_SHARE = 0.7  # of a pattern
 _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
 _LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses no rows of smaller ones
+# px^2: blurred rectangles and letters of 6 px look the same. Such circles are found if they are described.
+_SMALLEST = 45.0
 _BENT = 0.1  # greatest median of the second differences of centres, over the step
 # The second is at most 0.01 for circles, and 0.015 and more for squares of 8 px (6 px if sharp); the third at
 # most 0.08 for circles, and 0.15 for signs on keys.
@@ -82,7 +84,7 @@ def _seen_in(
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    if lopsided(grey.astype(np.float32), places, centre, area, _LOPSIDED):
+    if np.median(area) < _SMALLEST or lopsided(grey.astype(np.float32), places, centre, area, _LOPSIDED):
         return None
     full = share == 1
     return replace(seen, whole=full and _ends_seen(places, centre, area, grey.shape), full=full)
