@@ -148,7 +148,8 @@ def largest_expected(errors: PointErrors, kept: NDArray[np.bool_], points: Corre
     by_chance = np.sqrt(2 * np.log(len(errors.length) / _CHANCE))
     sigma = np.full(points.n_views, overall)
     index = points.view_index[rows]
-    with_large = np.unique(points.view_index[errors.length >= (overall + floor) * by_chance])
+    large = errors.length >= (overall + floor) * by_chance
+    with_large = np.flatnonzero(np.bincount(points.view_index[large], minlength=points.n_views))
     order = np.argsort(index, kind="stable") if with_large.size else index
     for view in with_large:
         piece = rows[order[slice(*np.searchsorted(index, [view, view + 1], sorter=order))]]
