@@ -94,7 +94,7 @@ def test_a_rig_that_moved_is_found_at_its_pair() -> None:
             cause.text
             == f"the rig moved between left{at:02}/right{at:02} and left{at + 1:02}/right{at + 1:02}"
         )
-        assert cause.found.explained > 0.9
+        assert cause.found.explained > 0.95
 
 
 def test_a_focal_length_that_changed_is_told_from_a_rig_that_moved() -> None:
