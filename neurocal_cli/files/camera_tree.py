@@ -18,8 +18,6 @@ from xml.etree import ElementTree
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import WITH_PRISM, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import checked_size
 from neurocal_cli.camera.opencv_names import to_ros
@@ -206,7 +204,7 @@ def image_size(root: Field) -> tuple[int, int] | None:
 
 
 def matrix_data(field: Field, length: int) -> Array:
-    """Read a matrix in row order: rows, cols and data, nested lists or a list; any `length` if it is -1."""
+    """Read matrices in row order: rows, cols and data, or lists of any depth; any `length` if it is -1."""
     if isinstance(field.value, dict) and "rows" not in field and "data" in field:
         return matrix_data(field["data"], length)
     if isinstance(field.value, dict):
@@ -225,8 +223,15 @@ def matrix_data(field: Field, length: int) -> Array:
             data = data[: rows * cols * channels]  # ROS reads no more
         if rows * cols * channels != len(data) or (length == 9 and rows != 3):
             raise InputError(f"{field.path} has {rows} rows, {cols} cols and {len(data)} numbers; correct it")
+    elif isinstance(field.value, list) and field.value and isinstance(field.value[0], dict):
+        data = np.concatenate(
+            [matrix_data(entry, -1) for entry in field.items()]
+        )  # of a matrix for each view
     elif isinstance(field.value, list) and field.value and isinstance(field.value[0], list):
-        data = field.array(-1, -1)
+        deep, first = 0, field.value
+        while isinstance(first, list):
+            deep, first = deep + 1, first[0] if first else None
+        data = field.array(*deep * (-1,))
         if length == 9 and data.shape != (3, 3):
             field.fail("3 x 3 numbers")
         data = data.ravel()
@@ -293,36 +298,3 @@ def format_panorama(panorama: Panorama) -> str:
 def _matrix(matrix: Array) -> str:
     rows, cols = matrix.shape
     return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))
-
-
-def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
-    """Find our name of a ROS (or OpenCV) model and its coefficients; an InputError lists the known ones.
-
-    All zeros mean no distortion, except for a fisheye, for which they mean an equidistant projection.
-    """
-    values = np.asarray(coefficients, dtype=float).ravel()
-    if name in ("equidistant", "fisheye") and values.size:
-        if len(values) != 4:
-            raise InputError(f"an equidistant (fisheye) lens has 4 coefficients, found {len(values)}")
-        return "fisheye", values
-    if not values.any():
-        return "none", np.zeros(0)
-    if name in WIDE:
-        if len(values) != len(WIDE[name]):
-            raise InputError(f"the model {name} has {len(WIDE[name])} coefficients, found {len(values)}")
-        return name, values
-    if name not in ("plumb_bob", "rational_polynomial", *WITH_PRISM):
-        raise InputError(
-            f"distortion model {name[:40]!r} is unknown; use plumb_bob, rational_polynomial, thin_prism, "
-            "tilted, equidistant, omnidir, double_sphere, eucm, rich"
-        )
-    if len(values) not in (4, 5, 8, 12, 14):
-        raise InputError(
-            "distortion has 4, 5, 8, 12 or 14 coefficients k1,k2,p1,p2,k3,..,k6,s1,..,s4,tauX,tauY, found "
-            f"{len(values)}"
-        )
-    padded = np.zeros(14)
-    padded[: len(values)] = values
-    lengths = {model: len(coefficient_names(model)) for model in ("plumb_bob", "rational", *WITH_PRISM)}
-    model = next(model for model, length in lengths.items() if not padded[length:].any())
-    return model, padded[: lengths[model]]

@@ -192,8 +192,8 @@ FAULTS = {
     "K: {rows: 3, cols: 3}\n": ": the key K.data is missing",
     "K: {rows: x, cols: 3, data: [1]}\n": ": K.rows must be a whole number",
     f"K: {FLAT}\nD: [1, 2]\n": ": distortion has 4, 5, 8, 12 or 14 coefficients",
-    f"K: {FLAT}\ndistortion_model: odd\nD: [1, 2, 3, 4]\n": ": distortion model 'odd' is unknown",
-    f"K: {FLAT}\ndistortion_model: equidistant\nD: [1, 2, 3, 4, 5]\n": ": an equidistant",
+    f"K: {FLAT}\ndistortion_model: odd\nD: [1, 2, 3, 4]\n": ": the model 'odd' of OpenCV is not known",
+    f"K: {FLAT}\ndistortion_model: equidistant\nD: [1, 2, 3, 4, 5]\n": ": the model equidistant has 4",
     f"K: {FLAT}\nimage_width: wide\nimage_height: 2\n": ": image_width must be a whole number",
     f"K: {FLAT}\nimage_width: 5000000\nimage_height: 2\n": ": image_size must be two positive whole numbers",
     f"K: {FLAT}\nimage_width: -4\nimage_height: 2\n": ": image_width must be a whole number, 0 or more",
@@ -211,6 +211,11 @@ FAULTS = {
 @pytest.mark.parametrize("text", FAULTS, ids=[v[:40] for v in FAULTS.values()])
 def test_a_fault_is_named_with_its_key_and_remedy(read, text):
     assert refused(read, text).startswith(FAULTS[text])
+
+
+def test_a_fisheye_filled_up_with_zeros_has_four_coefficients(read):
+    lens = read(f"K: {FLAT}\ndistortion_model: equidistant\nD: [0.1, 0.2, 0.3, 0.4, 0]\n").distortion
+    assert (lens.model, lens.coefficients.tolist()) == ("fisheye", [0.1, 0.2, 0.3, 0.4])
 
 
 def test_poses_need_a_neurocal_file(read):

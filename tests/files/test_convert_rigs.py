@@ -11,7 +11,7 @@ from neurocal_cli import Camera, Intrinsics, Pose
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import euler_to_rotation
 from neurocal_cli.files.exchange.camera_set import CameraSet, adapt_cameras
-from neurocal_cli.files.exchange.dictionary import multiview_entries
+from neurocal_cli.files.exchange.dictionary import entries
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
 
 LENSES = {
@@ -68,4 +68,4 @@ def test_opencv_mixes_lenses_in_its_file_of_several_cameras(tmp_path: Path) -> N
     assert np.allclose(storage.getNode("Ts").mat()[2], given.relative[1].t)
     models = [camera.distortion.model for camera in read_cameras([path]).cameras]
     assert models == ["fisheye", "plumb_bob", "plumb_bob"]
-    assert multiview_entries(given)["cam_ids"] == "cam0,cam1,cam2"
+    assert entries(given)["cam_ids"] == "cam0,cam1,cam2"

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.distortion import MODELS, WITH_PRISM, Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_tree import from_ros
 from neurocal_cli.files.exchange.camera_names import have_gap, matrix_of, may_be_distortion
 from neurocal_cli.files.exchange.tree_paths import at, find, numbers, numbers_at, put, split
 from neurocal_cli.files.tree_fields import Field
@@ -157,7 +157,9 @@ class CameraKeys:
         if lens.ours in _POLYNOMIAL[:4] and len(values) == count and values.any():
             return Distortion(lens.ours, values)
         if lens.ours in _POLYNOMIAL:
-            return Distortion(*from_ros("plumb_bob", np.pad(values, (0, max(0, 5 - len(values))))))
+            return _ordinary(
+                values if len(lens.places) == 1 else np.pad(values, (0, max(0, 5 - len(values))))
+            )
         if not values[count:].any():
             values = values[:count]
         if len(values) != count:
@@ -226,6 +228,19 @@ class CameraKeys:
             put(tree, self.skew, skew)
         _put_all(tree, lens.places, distortion.coefficients.tolist())
         return tree
+
+
+def _ordinary(values: Array) -> Distortion:
+    """OpenCV's coefficients in the smallest of its models that has them; all zeros are no distortion."""
+    if not values.any():
+        return Distortion()
+    if len(values) not in (4, 5, 8, 12, 14):
+        raise InputError(
+            "distortion has 4, 5, 8, 12 or 14 coefficients k1,k2,p1,p2,k3,..,k6,s1,..,s4,tauX,tauY, found "
+            f"{len(values)}"
+        )
+    models = ("plumb_bob", "rational", *WITH_PRISM)
+    return Distortion(next(one for one in models if not values[len(MODELS[one]) :].any()), values)
 
 
 def _put_all(tree: dict[str, Any], paths: tuple[str, ...], values: Any) -> None:

@@ -14,68 +14,64 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.tree_fields import is_number
 
-# Of the images as they were taken, where a file has the matrix of undistorted ones as well.
-ORIGINAL = (
-    "cammatrixoriginal", "cameramatrixoriginal", "originalcameramatrix", "originalcammatrix", "koriginal",
-    "korig", "originalk", "mtxoriginal", "kraw", "rawk", "cameramatrixraw", "kdistorted",
-)  # fmt: skip
-# The first are written here and by ROS and OpenCV; in OpenCV's stereo sample the left camera has M1 and D1.
-MATRIX = (
-    "cameramatrix", "k", "mtx", "m", "intrinsicmatrix", "intrinsicsmatrix", "cameraintrinsics", "intrinsics",
-    "cameraintrinsic", "intrinsic", "camintrinsics", "cammatrix", "cammtx", "cameramtx", "kmatrix", "kmat",
-    "matrix", "intrinsicmat", "intrinsicparameters", "calibrationmatrix", "intrinsicparams", "camerak",
-    "cameramat", "kk", "m1", "cm", "intrinsicmtx", "camk", "camintr",
-)  # fmt: skip
-COEFFICIENTS = (
-    "distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "distortioncoeffs",
-    "distortioncoeff", "distortioncoefs", "distortioncoef", "distortioncoefficient", "distcoefficients",
-    "distortion", "distortions", "dist", "d", "kc", "coefs", "coeffs", "coef", "coefficients",
-    "distortionparameters", "distortionparams", "distparams", "distortionvector", "distortionmatrix",
-    "distvec", "lensdistortion", "cameradistortion", "distmtx", "distmatrix", "camdist", "disto", "distcof",
-    "distcoffs", "distortioncoefficents", "distortionvalues", "opencvdistortion", "d1",
-    "cameradistcoeffs", "camdistcoeffs", "cameradistcoeff", "camdistcoeff", "cameradistortioncoefficients",
-    "lensdistortioncoefficients", "distortioncoeficients", "distcoefficient",
-)  # fmt: skip
-ENTRIES = (
-    ("fx", "flx", "focalx", "fu", "focallengthx", "fxpx", "focallengthxpx"),
-    ("fy", "fly", "focaly", "fv", "focallengthy", "fypx", "focallengthypx"),
-    ("cx", "ppx", "u0", "pu", "principalpointx", "cxpx", "focalcenterxpx"),
-    ("cy", "ppy", "v0", "pv", "principalpointy", "cypx", "focalcenterypx"),
-)
-# Of both axes, or one for both.
-FOCAL = ("focallength", "focallengths", "focal", "focalpx", "focallengthpx", "f")
-CENTRE = ("principalpoint", "principlepoint", "opticalcenter", "princpt", "imagecenter", "c")
-ASPECT = ("aspectratio", "pixelaspectratio", "pixelratio", "pixelaspect")
-RADIAL = ("radialdistortion", "radial", "radialcoefficients", "radialdistortioncoefficients", "radialcoeffs")
-TANGENTIAL = (
-    "tangentialdistortion", "tangential", "tangentialcoefficients", "tangentialdistortioncoefficients",
-    "tangentialcoeffs",
-)  # fmt: skip
-WIDTH = (
-    "imagewidth", "width", "w", "imgwidth", "imgw", "framewidth", "resolutionx", "imgsizex", "resx",
-    "widthpx",
-)  # fmt: skip
-HEIGHT = (
-    "imageheight", "height", "h", "imgheight", "imgh", "frameheight", "resolutiony", "imgsizey", "resy",
-    "heightpx",
-)  # fmt: skip
-SIZE = (
-    "imagesize", "imgsize", "resolution", "size", "dim", "dims", "imageresolution", "imagedimensions",
-    "dimensions", "framesize", "calibdimension", "cameraresolution", "imsize", "calibrationresolution",
-    "capturedimagesize",
-)  # fmt: skip
-SHAPE = ("imageshape", "imgshape", "shape", "grayshape", "frameshape")  # NumPy's: height and width
+# The keys of a camera as they are written here, by ROS and by OpenCV, and how else people call them.
+_OTHERS = {
+    "camera_name": "",
+    "image_width": "width w imgwidth imgw framewidth resolutionx imgsizex resx widthpx",
+    "image_height": "height h imgheight imgh frameheight resolutiony imgsizey resy heightpx",
+    "image_size": (  # width and height
+        "imgsize resolution size dim dims imageresolution imagedimensions dimensions framesize "
+        "calibdimension cameraresolution imsize calibrationresolution capturedimagesize"
+    ),
+    "image_shape": "imgshape shape grayshape frameshape",  # NumPy's: height and width
+    # Its text names the model; an unknown word is refused in the first, ignored in the second.
+    "distortion_model": "distmodel distortiontype disttype distortion",
+    "camera_model": (
+        "calibrationmodel opencvmodel model cameratype projection projectionmodel lensmodel lenstype "
+        "modeltype type calibrationtype projectiontype lens"
+    ),
+    "fisheye_model": "fisheye isfisheye usefisheye useopencvfisheye",  # true or false
+    "xi": "",
+    # Of the images as they were taken, where a file has the matrix of undistorted ones as well.
+    "original_matrix": (
+        "cammatrixoriginal cameramatrixoriginal originalcameramatrix originalcammatrix koriginal korig "
+        "originalk mtxoriginal kraw rawk cameramatrixraw kdistorted"
+    ),
+    "camera_matrix": (  # in OpenCV's stereo sample the left camera has M1 and D1
+        "k mtx m intrinsicmatrix intrinsicsmatrix cameraintrinsics intrinsics cameraintrinsic intrinsic "
+        "camintrinsics cammatrix cammtx cameramtx kmatrix kmat matrix intrinsicmat intrinsicparameters "
+        "calibrationmatrix intrinsicparams camerak cameramat kk m1 cm intrinsicmtx camk camintr"
+    ),
+    "distortion_coefficients": (
+        "distcoeffs distcoeff distcoefs distcoef distortioncoeffs distortioncoeff distortioncoefs "
+        "distortioncoef distortioncoefficient distcoefficients distortion distortions dist d kc coefs "
+        "coeffs coef coefficients distortionparameters distortionparams distparams distortionvector "
+        "distortionmatrix distvec lensdistortion cameradistortion distmtx distmatrix camdist disto distcof "
+        "distcoffs distortioncoefficents distortionvalues opencvdistortion d1 cameradistcoeffs "
+        "camdistcoeffs cameradistcoeff camdistcoeff cameradistortioncoefficients "
+        "lensdistortioncoefficients distortioncoeficients distcoefficient"
+    ),
+    "fx": "flx focalx fu focallengthx fxpx focallengthxpx",
+    "fy": "fly focaly fv focallengthy fypx focallengthypx",
+    "cx": "ppx u0 pu principalpointx cxpx focalcenterxpx",
+    "cy": "ppy v0 pv principalpointy cypx focalcenterypx",
+    "skew": "s",
+    "focal_length": "focallengths focal focalpx focallengthpx f",  # of both axes, or one for both
+    "principal_point": "principlepoint opticalcenter princpt imagecenter c",
+    "aspect_ratio": "pixelaspectratio pixelratio pixelaspect",
+    "radial_distortion": "radial radialcoefficients radialdistortioncoefficients radialcoeffs",
+    "tangential_distortion": (
+        "tangential tangentialcoefficients tangentialdistortioncoefficients tangentialcoeffs"
+    ),
+    "R": "rstereo stereor rotation rotationmatrix rot",  # of the second camera
+    "T": "tstereo stereot translation translationvector trans trns",
+    "rectification_matrix": "r",
+    "projection_matrix": "p",
+}
 # Of all numbers in one list: fx, fy, cx, cy, and the coefficients.
-PARAMETERS = (*MATRIX, "calibration", "calib", "cameraparams", "cameraparameters")
-NAME = ("cameraname",)
+_PARAMETERS = "calibration calib cameraparams cameraparameters"
+ENTRIES = ("fx", "fy", "cx", "cy")
 
-# Keys whose text names the distortion model; an unknown word is refused in the first, ignored in the others.
-MODEL = ("distortionmodel", "distmodel", "distortiontype", "disttype", "distortion")
-KIND = (
-    "cameramodel", "calibrationmodel", "opencvmodel", "model", "cameratype", "projection", "projectionmodel",
-    "lensmodel", "lenstype", "modeltype", "type", "calibrationtype", "projectiontype", "lens",
-)  # fmt: skip
-FISHEYE = ("fisheyemodel", "fisheye", "isfisheye", "usefisheye", "useopencvfisheye")  # true or false
 UNKNOWN = "unknown"
 # What the words mean, the first that is found; "" says nothing that a coefficient could contradict.
 _WORDS = (
@@ -120,6 +116,10 @@ def plain(name: str) -> str:
     return letters.replace("distors", "distort").replace("coefficent", "coefficient")
 
 
+NAMES = {key: (plain(key), *others.split()) for key, others in _OTHERS.items()}
+PARAMETERS = (*NAMES["camera_matrix"], *_PARAMETERS.split())
+
+
 def means(word: str) -> str | None:
     """ROS's name of the distortion model that a word names, ``unknown``, or None if it names none."""
     return next((model for pattern, model in _WORDS if re.search(pattern, plain(word))), None)
@@ -161,9 +161,9 @@ def has_entries(value: Any) -> bool:
         return False
     names = {plain(str(key)) for key, entry in value.items() if not isinstance(entry, (dict, list))}
     pairs = {plain(str(key)) for key, entry in value.items() if is_numbers(entry)}
-    one = not names.isdisjoint(FOCAL)  # for both axes
-    return all(not names.isdisjoint(entry) for entry in ENTRIES[2 if one else 0 :]) or not (
-        pairs.isdisjoint(FOCAL) or pairs.isdisjoint(CENTRE)
+    one = not names.isdisjoint(NAMES["focal_length"])  # for both axes
+    return all(not names.isdisjoint(NAMES[key]) for key in ENTRIES[2 if one else 0 :]) or not (
+        pairs.isdisjoint(NAMES["focal_length"]) or pairs.isdisjoint(NAMES["principal_point"])
     )
 
 

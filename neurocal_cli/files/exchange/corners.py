@@ -23,7 +23,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.camera_tree import parse_tree
-from neurocal_cli.files.exchange.camera_names import SHAPE, plain
+from neurocal_cli.files.exchange.camera_names import NAMES, plain
 from neurocal_cli.files.exchange.corner_tables import (
     BY_CELL,
     Given,
@@ -159,7 +159,7 @@ def _corners(
 def _size(root: Field, pixels: Array) -> tuple[int, int] | None:
     """Size of the images; a shape is height and width, or with pixels beyond it width and height."""
     size = LooseKeys(root).image_size() if isinstance(root.value, dict) else None
-    shape = isinstance(root.value, dict) and any(plain(key) in SHAPE for key in root.value)
+    shape = isinstance(root.value, dict) and any(plain(key) in NAMES["image_shape"] for key in root.value)
     if size is not None and shape and (pixels > size).any() and (pixels <= size[::-1]).all():
         return size[::-1]
     return size

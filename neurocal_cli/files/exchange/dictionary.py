@@ -3,7 +3,8 @@
 One camera has ``camera_matrix`` and ``distortion_coefficients``; two have ``M1, D1, M2, D2, R, T`` as in
 OpenCV's stereo sample. Poses of views are ``extrinsic_parameters``, with a row of rotation vector and
 translation for each view as in OpenCV's calibration sample, or ``rvecs`` and ``tvecs`` as returned by
-``calibrateCamera``. OpenCV's omnidirectional cameras have ``xi`` in addition to k1, k2, p1, p2.
+``calibrateCamera``. OpenCV's omnidirectional cameras have ``xi`` in addition to k1, k2, p1, p2. What people
+save under other names of these is read by `loose_keys`.
 
 Three cameras and more are as OpenCV's multi-view sample saves what ``calibrateMultiview`` returns: ``Ks``,
 ``distortions``, ``rvecs`` and ``Ts`` (``X_k = R X_0 + T``), ``is_fisheye``, ``image_sizes`` and ``cam_ids``
@@ -24,21 +25,48 @@ import numpy as np
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_names import PARAMETERS, plain, plain_lists
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted, to_vector
+from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, plain, plain_lists
+from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
-from neurocal_cli.files.exchange.format_table import PoseKeys
+from neurocal_cli.files.exchange.format_table import PoseKeys, table
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
+from neurocal_cli.files.exchange.tree_paths import arrays, under
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import nested
 
-# One of several cameras, which has its part of each array.
+_K = "distortion_coefficients"
+_WRITTEN = (
+    Lens(("plumb_bob",), "plumb_bob", (_K,)),
+    Lens(("rational_polynomial", "rational"), "rational", (_K,)),
+    Lens(("thin_prism",), "thin_prism", (_K,)),
+    Lens(("tilted",), "tilted", (_K,)),
+    Lens(("equidistant", "fisheye"), "fisheye", (_K,)),
+    Lens(("omnidir",), "omnidir", ("xi", *under(f"{_K}/", *"0123"))),
+)
+_READ = (
+    Lens(("none",), "none", ()),
+    *(Lens((ours,), ours, (_K,)) for ours in ("k1k2", "k1k2p1p2", "double_sphere", "eucm", "rich")),
+    Lens(("k1",), "k1", (f"{_K}/0",)),
+)
+KEYS = CameraKeys(
+    "OpenCV",
+    ("camera_matrix:matrix",),
+    (*_WRITTEN, *_READ),
+    model="distortion_model",
+    size=("image_width", "image_height"),
+    name="camera_name",
+)
+MODELS = replace(KEYS, lenses=_WRITTEN).models
+_OF_TWO = {"camera_matrix": "M", _K: "D"}  # the other keys of two cameras are those of one
+_PLACED = PoseKeys(("R", "T"))  # from the first camera
+_ROWS, _VECTORS, _VIEWS, _UNIT = "extrinsic_parameters", ("rvecs", "tvecs"), "view_names", "unit"
+
+# Several cameras, of which each has its part of each array.
 _MULTIVIEW = CameraKeys(
     "OpenCV",
     ("Ks:matrix",),
@@ -55,8 +83,8 @@ _ARRAYS = ("Ks", "distortions", "rvecs", "Ts", "is_fisheye", "image_sizes")  # t
 _FEWEST = 5
 
 
-def multiview_entries(cameras: CameraSet) -> dict[str, Any]:
-    """The dictionary of the cameras: texts and matrices."""
+def _multiview_tree(cameras: CameraSet) -> dict[str, Any]:
+    """The dictionary of three cameras or more: texts and matrices."""
     if any(camera.distortion.model == "omnidir" for camera in cameras.cameras):
         raise InputError("OpenCV's file of several cameras has no omnidirectional ones; write another format")
     trees = [_MULTIVIEW.tree(camera) for camera in cameras.cameras]
@@ -69,90 +97,66 @@ def multiview_entries(cameras: CameraSet) -> dict[str, Any]:
     if not stacked["image_sizes"].all():
         del stacked["image_sizes"]
     names = ",".join(tree["cam_ids"].replace(",", "_") for tree in trees)
-    return {"cam_ids": names, **stacked, **({} if cameras.unit is None else {"unit": cameras.unit})}
+    return {"cam_ids": names, **stacked, **({} if cameras.unit is None else {_UNIT: cameras.unit})}
 
 
-def is_multiview(root: Field) -> bool:
-    """Whether a dictionary is one of several cameras."""
-    return isinstance(root.value, dict) and set(_ARRAYS[:4]) <= set(root.value)
-
-
-def multiview_cameras(root: Field) -> CameraSet:
-    """Read the cameras; see `multiview_entries`."""
-    n = len(_flat(root["Ks"], 9)) // 9
-    if not n:
-        root["Ks"].fail("a matrix of 3 x 3 for each camera")
-    arrays = {key: _of_each(root[key], n).tolist() for key in _ARRAYS if key in root}
-    arrays["is_fisheye"] = [str(int(row[0] > 0)) for row in arrays.get("is_fisheye", n * [[0.0]])]
+def _multiview_parts(document: Document) -> dict[str, Field]:
+    root = Field(plain_lists(document.root.value), document.source)
+    n = len(_rows(root["Ks"], 9))
+    of_each: dict[str, Any] = {}
+    for key in _ARRAYS:
+        if key in root:
+            data = matrix_data(root[key], -1)
+            if len(data) % n:
+                root[key].fail(f"numbers for each of {n} cameras")
+            of_each[key] = data.reshape(n, -1).tolist()
+    of_each["is_fisheye"] = [str(int(row[0] > 0)) for row in of_each.get("is_fisheye", n * [[0.0]])]
     names = str(root.get("cam_ids", "").value).split(",")
-    arrays["cam_ids"] = names if len(names) == n else [f"cam{k}" for k in range(n)]
-    parts = [Field({key: of[k] for key, of in arrays.items()}, root.source, root.path) for k in range(n)]
-    cameras, poses = map(_MULTIVIEW.camera, parts), map(_FROM_FIRST.read, parts)
-    return mounted(list(cameras), list(poses), "OpenCV", root.read("unit", Field.text))
+    of_each["cam_ids"] = names if len(names) == n else [f"cam{k}" for k in range(n)]
+    unit = {_UNIT: root.get(_UNIT).value}
+    return {f"{k}": Field({key: of[k] for key, of in of_each.items()} | unit, root.source) for k in range(n)}
 
 
-def _of_each(field: Field, n: int) -> Array:
-    """(n, m) numbers of each of n cameras."""
-    data = _flat(field)
-    if not len(data) or len(data) % n:
-        field.fail(f"numbers for each of {n} cameras")
-    return data.reshape(n, -1)
-
-
-def _flat(field: Field, width: int = 1) -> Array:
-    """Numbers in nested lists of any depth, in a matrix, or in a list of matrices; a multiple of `width`."""
-    value = field.value
-    if isinstance(value, dict):
-        values = matrix_data(field, -1)
-    elif isinstance(value, list) and value and isinstance(value[0], dict):
-        values = np.concatenate([matrix_data(entry, width) for entry in field.items()])
-    else:
-        try:
-            values = np.array(value, dtype=float).ravel()
-        except (TypeError, ValueError):
-            field.fail("numbers")
-    if not np.isfinite(values).all() or len(values) % width:
-        field.fail(f"{width} finite numbers for each" if width > 1 else "finite numbers")
-    return values
+def _rows(field: Field, width: int) -> Array:
+    """Rows of so many numbers, in any form."""
+    data = matrix_data(field, -1)
+    if not len(data) or len(data) % width:
+        field.fail(f"{width} numbers for each")
+    return data.reshape(-1, width)
 
 
 def entries(cameras: CameraSet) -> dict[str, Any]:
     """Make the dictionary of cameras: texts, numbers, lists of names and matrices."""
     if len(cameras.cameras) > 2:
-        return multiview_entries(cameras)
-    first = cameras.cameras[0]
+        return _multiview_tree(cameras)
     tree: dict[str, Any] = {}
     sides = ("",) if len(cameras.cameras) == 1 else ("1", "2")
-    same = all(camera.image_size == first.image_size for camera in cameras.cameras)
+    same = len({camera.image_size for camera in cameras.cameras}) == 1
     for side, camera in zip(sides, cameras.cameras, strict=True):
-        end = "" if same else side
-        tree[f"camera_name{side}"] = camera.name
-        if camera.image_size is not None and (f"image_width{end}" not in tree):
-            tree[f"image_width{end}"], tree[f"image_height{end}"] = camera.image_size
-        model, k = to_ros(camera.distortion.model, camera.distortion.coefficients)
-        tree[f"distortion_model{side}"] = model
-        if model == "omnidir":
-            tree[f"xi{side}"], k = float(k[0]), k[1:]
-        tree[f"M{side}" if side else "camera_matrix"] = camera.A
-        tree[f"D{side}" if side else "distortion_coefficients"] = k[None]
+        own = arrays(KEYS.tree(camera))
+        for key in NAMES:
+            if key not in own or (key in KEYS.size and camera.image_size is None):
+                continue
+            end = "" if key in KEYS.size and same else side
+            tree[f"{_OF_TWO.get(key, key) if side else key}{end}"] = own[key]
     if cameras.has_lengths and cameras.unit is not None:
-        tree["unit"] = cameras.unit
+        tree[_UNIT] = cameras.unit
     if cameras.relative:
         (pose,) = cameras.relative
-        tree |= {"R": pose.R, "T": pose.t[:, None]}
+        tree |= dict(zip(_PLACED.paths, (pose.R, pose.t[:, None]), strict=True))
         rig = as_stereo(cameras)
         tree |= {"E": rig.E, "F": rig.F}
         rectified = rectify(rig)
         if rectified is not None:
             tree |= {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
     if cameras.poses:
-        tree["view_names"] = list(cameras.poses)
+        tree[_VIEWS] = list(cameras.poses)
         rows = [np.concatenate([to_vector(pose.R), pose.t]) for pose in cameras.poses.values()]
-        tree["extrinsic_parameters"] = np.array(rows)
+        tree[_ROWS] = np.array(rows)
     return tree
 
 
-def opencv_text(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
+def _opencv_text(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
     """Write the dictionary for ``cv2.FileStorage``."""
     tree = entries(cameras)
     if "Ks" not in tree and any(camera.distortion.model == "fisheye" for camera in cameras.cameras):
@@ -187,8 +191,6 @@ _SIDES = (
     ("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"), ("cam0", "cam1"), ("cam1", "cam2"),
     ("camera0", "camera1"), ("camera1", "camera2"), ("cameraleft", "cameraright"),
 )  # fmt: skip
-_ROTATIONS = ("r", "rstereo", "stereor", "rotation", "rotationmatrix", "rot")
-_TRANSLATIONS = ("t", "tstereo", "stereot", "translation", "translationvector", "trans", "trns")
 
 
 def is_part(document: Document) -> bool:
@@ -197,56 +199,55 @@ def is_part(document: Document) -> bool:
         return False
     keys = LooseKeys(document.root)
     cameras = _sides(keys) is not None
-    return cameras != (keys.find(_TRANSLATIONS) is not None) and (cameras or not keys.has_camera())
+    return cameras != (keys.find("T") is not None) and (cameras or not keys.has_camera())
 
 
-def read(document: Document) -> CameraSet:
-    """Read one camera or two."""
-    found = from_tree(document.root, document)
-    if document.is_script:
-        document.warnings.append(f"{document.source}: {FROM_ZERO}")
-    return found
-
-
-def from_tree(root: Field, document: Document) -> CameraSet:
-    """Read one camera or two from a dictionary, or those in it that have poses of their own."""
-    root = Field(plain_lists(root.value), root.source, root.path)
-    if is_multiview(root):
-        several = multiview_cameras(root)
-        for camera in several.cameras:
-            note_size(camera, document)
-        return several
-    if (rig := _posed(root, document)) is not None:
-        return rig
+def _parts(document: Document) -> dict[str, Field]:
+    """One camera or two of a dictionary under our keys, or those in it that have poses of their own."""
+    root = Field(plain_lists(document.root.value), document.source)
+    if posed := _posed(root, document):
+        return posed
     root = _within(root, document.notes)
-    unit = root.read("unit", Field.text)
     keys = LooseKeys(root, document.distortion, document.notes)
     sides = _sides(keys)
     if sides is None:
         one = next((side for pair in _SIDES[:3] for side in pair if keys.has_camera(side)), "")
-        camera = keys.camera("" if keys.has_camera() else one)
-        keys.refuse_unread()
-        keys.note_others()
-        note_size(camera, document)
-        return CameraSet((camera,), (), _poses(root), unit)
-    cameras = tuple(keys.camera(side) for side in sides)
+        trees = [keys.tree("" if keys.has_camera() else one)]
+    else:
+        trees = [keys.tree(side) for side in sides]
     keys.refuse_unread()
-    lacking = [side for side in sides if not keys.has_coefficients(side)]
-    if len(lacking) == 1:
-        raise InputError(
-            f"the camera {lacking[0]!r} has no distortion coefficients under a known name, the other has; "
-            "name them alike, or add zeros"
+    if sides is None:
+        keys.note_others()
+    else:
+        lacking = [side for side, tree in zip(sides, trees, strict=True) if _K not in tree]
+        if len(lacking) == 1:
+            raise InputError(
+                f"the camera {lacking[0]!r} has no distortion coefficients under a known name, the other has;"
+                " name them alike, or add zeros"
+            )
+        R, t = map(keys.find, _PLACED.paths)
+        if R is None or t is None:
+            raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
+        poses = (
+            (np.eye(3).tolist(), [0.0, 0.0, 0.0]),
+            (matrix_data(R, 9).tolist(), matrix_data(t, 3).tolist()),
         )
-    R, t = keys.find(_ROTATIONS), keys.find(_TRANSLATIONS)
-    if R is None or t is None:
-        raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
-    for camera in cameras:
-        note_size(camera, document)
-    pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))
-    return CameraSet(cameras, (pose,), _poses(root), unit)
+        for tree, pose in zip(trees, poses, strict=True):
+            tree |= zip(_PLACED.paths, pose, strict=True)
+    if document.is_script:
+        document.warnings.append(f"{document.source}: {FROM_ZERO}")
+    trees[0] |= {key: root[key].value for key in (_ROWS, *_VECTORS, _VIEWS, _UNIT) if key in root}
+    return {str(k): Field(tree, root.source) for k, tree in enumerate(trees)}
 
 
-def note_size(camera: Camera, document: Document) -> None:
+def with_sizes_noted(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
+    """The cameras; warnings are appended about the principal points of images of given size."""
+    for camera in found.cameras:
+        _note_size(camera, document)
+    return found
+
+
+def _note_size(camera: Camera, document: Document) -> None:
     """Append a warning if the principal point is far outside the image, or its sides are exchanged.
 
     Raises InputError for a focal length that is not in pixels.
@@ -283,7 +284,7 @@ def note_size(camera: Camera, document: Document) -> None:
         )
 
 
-def _posed(root: Field, document: Document) -> CameraSet | None:
+def _posed(root: Field, document: Document) -> dict[str, Field]:
     """Cameras in a list or a mapping, each with its rotation vector and translation as OpenCV has them.
 
     Those of the Panoptic data set have R and t, from the world as well.
@@ -295,23 +296,22 @@ def _posed(root: Field, document: Document) -> CameraSet | None:
         for name, part in parts
         if isinstance(part, dict) and LooseKeys(Field(part, "")).has_camera()
     ]
-    if len(found) < 2:
-        return None
-    cameras, poses = [], []
-    for name, part in found:
+    trees = {}
+    for name, part in found if len(found) > 1 else ():
         keys = LooseKeys(part, document.distortion, document.notes)
-        r, t = keys.find(("rvec",)), keys.find(("tvec",))
-        R = None if r is None or (turn := _flat(r, 3)).size != 3 else from_vector(turn)
+        r, t = keys.find("rvec"), keys.find("tvec")
         if "distCoef" in part and "R" in part:
-            R, t = matrix_data(part["R"], 9).reshape(3, 3), keys.find(("t",))
-        if R is None or t is None:
-            return None
+            r, t = part["R"], keys.find("t")
+        if r is None or t is None:
+            return {}
         stated = part.get("name").value
-        cameras.append(replace(keys.camera(), name=stated if isinstance(stated, str) else name))
+        pose = dict(zip(_PLACED.paths, (matrix_data(one, -1).tolist() for one in (r, t)), strict=True))
+        tree = {**keys.tree(), **pose, "camera_name": stated if isinstance(stated, str) else name}
         keys.refuse_unread()
-        note_size(cameras[-1], document)
-        poses.append(Pose(R, _flat(t, 3)))
-    return mounted(cameras, poses, "OpenCV", root.get("unit").value if isinstance(root.value, dict) else None)
+        trees[name] = Field(tree, root.source, name)
+    if trees and isinstance(root.value, dict):
+        next(iter(trees.values())).value[_UNIT] = root.get(_UNIT).value
+    return trees
 
 
 def _within(root: Field, notes: list[str]) -> Field:
@@ -332,7 +332,7 @@ def _within(root: Field, notes: list[str]) -> Field:
             break
         name, part = next(iter(parts.items()))
         if len(parts) > 1:
-            cameras = [_numbers_of(part) for part in parts.values()]
+            cameras = [_camera_of(part) for part in parts.values()]
             if None in cameras or any(camera != cameras[0] for camera in cameras):
                 names = ", ".join(key[:20] for key in list(parts)[:9])
                 raise InputError(
@@ -363,7 +363,7 @@ def _sides_apart(tree: dict[str, Any]) -> dict[str, Any]:
         if isinstance(part, dict) and {plain(str(key)) for key in part} & {"r", "t"} == {"r", "t"}:
             tree = {**part, **tree}
     names = {plain(str(key)): key for key, part in tree.items()}
-    if names.keys().isdisjoint(_TRANSLATIONS):
+    if names.keys().isdisjoint(NAMES["T"]):
         return tree
     names = {name: key for name, key in names.items() if _holds_camera(tree[key], 0)}
     for pair in _SIDES:
@@ -384,14 +384,12 @@ def _holds_camera(tree: Any, depth: int = _DEEPEST) -> bool:
     return depth > 0 and any(_holds_camera(part, depth - 1) for part in tree.values())
 
 
-def _numbers_of(tree: Any) -> list[Any] | None:
+def _camera_of(tree: Any) -> dict[str, Any] | None:
     """All that a camera says; None if it cannot be read."""
     try:
-        camera = LooseKeys(_within(Field(tree, ""), [])).camera()
+        return LooseKeys(_within(Field(tree, ""), [])).tree()
     except NeurocalError:
         return None
-    lens = camera.distortion
-    return [*camera.entries, lens.model, *lens.coefficients.tolist(), camera.image_size]
 
 
 def _sides(keys: LooseKeys) -> tuple[str, str] | None:
@@ -404,61 +402,64 @@ def _sides(keys: LooseKeys) -> tuple[str, str] | None:
     return found[0] if found else None
 
 
-def _poses(root: Field) -> dict[str, Pose]:
-    if "extrinsic_parameters" in root:
-        rows = matrix_data(root["extrinsic_parameters"], -1)
-        if len(rows) % 6:
-            root["extrinsic_parameters"].fail("six numbers for each view")
-        rows = rows.reshape(-1, 6)
-    elif "rvecs" in root and "tvecs" in root:
-        vectors = [_flat(root[key], 3).reshape(-1, 3) for key in ("rvecs", "tvecs")]
+def _views(root: Field) -> dict[str, Pose]:
+    """Poses of the views of the first camera."""
+    if _ROWS in root:
+        rows = _rows(root[_ROWS], 6)
+    elif all(key in root for key in _VECTORS):
+        vectors = [_rows(root[key], 3) for key in _VECTORS]
         if len(vectors[0]) != len(vectors[1]):
-            root["tvecs"].fail("as many translations as there are rvecs")
+            root[_VECTORS[1]].fail(f"as many translations as there are {_VECTORS[0]}")
         rows = np.hstack(vectors)
     else:
         return {}
     names = [f"{number}" for number in range(1, len(rows) + 1)]
-    if "view_names" in root:
-        names = root["view_names"].names(len(rows))
+    if _VIEWS in root:
+        names = root[_VIEWS].names(len(rows))
     return {name: Pose(from_vector(row[:3]), row[3:]) for name, row in zip(names, rows, strict=True)}
 
 
-_ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
+def _unit(root: Field) -> str | None:
+    return root.read(_UNIT, Field.text)
 
 
-def _anything(document: Document) -> bool:
-    return bool(document.tree) or isinstance(document.root.value, list)
-
-
-_RIG = "`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`"
-OPENCV = Format(
-    "OpenCV",
-    _ALL,
-    opencv_text,
-    _anything,
-    read,
-    files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
+MULTIVIEW = table(
+    _MULTIVIEW,
+    " ".join(_ARRAYS[:4]),
+    "cv2.FileStorage of several cameras, as its multi-view sample writes it",
+    parts=_multiview_parts,
+    pose=_FROM_FIRST,
+    unit=_unit,
+    finish=with_sizes_noted,
+    most_cameras=99,
+    rig="`rvecs, Ts`: `X_k = R X_0 + T`",
+)
+OPENCV = table(
+    KEYS,
+    lambda document: document.tree or isinstance(document.root.value, list),
+    "cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
+    parts=_parts,
+    pose=_PLACED,
+    unit=_unit,
+    views=_views,
+    finish=with_sizes_noted,
+    text=_opencv_text,
+    models=MODELS,
+    marks=frozenset(),
     poses=True,
     most_cameras=99,
-    rig=_RIG,
+    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
 )
-JSON = Format(
-    "JSON",
-    _ALL,
-    lambda set_, _: {"": json_text(entries(set_))},
+JSON = replace(
+    OPENCV,
+    program="JSON",
+    text=lambda cameras, _: {"": json_text(entries(cameras))},
     files="dictionary of the same names",
     skew=True,
-    poses=True,
-    most_cameras=99,
-    rig=_RIG,
 )
-NPZ = Format(
-    "NumPy",
-    _ALL,
-    lambda set_, _: {"": npz_bytes(entries(set_))},
+NPZ = replace(
+    JSON,
+    program="NumPy",
+    text=lambda cameras, _: {"": npz_bytes(entries(cameras))},
     files=".npz; .npy of the matrix, and of the coefficients",
-    skew=True,
-    poses=True,
-    most_cameras=99,
-    rig=_RIG,
 )

@@ -97,13 +97,12 @@ class Document:
         self.distortion, self.size = distortion, size
         self.is_script = False  # of MATLAB or Octave, perhaps
 
-    def joined(self, other: Document) -> Document:
-        """The document with the keys of another as well."""
-        both = copy.copy(self)
-        both.source = f"{self.source}, {other.source}"
-        both.__dict__["tree"] = {**self.tree, **other.tree}
-        both.__dict__["root"] = Field(both.tree, both.source)
-        return both
+    def with_tree(self, tree: dict[str, Any], source: str = "") -> Document:
+        """The document with another tree, and without its text."""
+        other = copy.copy(self)
+        other.source = source or self.source
+        other.__dict__ |= {"tree": tree, "root": Field(tree, other.source), "text": "", "array": None}
+        return other
 
     @cached_property
     def is_text(self) -> bool:

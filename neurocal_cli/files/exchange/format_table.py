@@ -24,6 +24,7 @@ a file says in other words, such as a principal point from the middle of the ima
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,9 @@ def table(
     *,
     parts: Parts = lambda document: {"camera": document.root},
     pose: PoseKeys | Poses | None = None,
-    unit: str | None = "m",
+    unit: str | Callable[[Field], str | None] | None = "m",
+    views: Callable[[Field], Mapping[str, Pose]] | None = None,
+    finish: Callable[[CameraSet, Mapping[str, Field], Document], CameraSet] | None = None,
     project: bool = False,
     write: Callable[[Any], str] | None = None,
     whole: Callable[[list[Tree], CameraSet], Any] | None = None,
@@ -141,8 +144,12 @@ def table(
         The tree of each camera of a file, by its name.
     pose : PoseKeys or callable, optional
         Keys of the pose in that tree, or what finds the poses of all.
-    unit : str, optional
-        Unit of lengths; None if a file does not state it.
+    unit : str or callable, optional
+        Unit of lengths, or what finds it in the tree of the first camera; None if a file does not state it.
+    views : callable, optional
+        What finds the poses of views in the tree of the first camera.
+    finish : callable, optional
+        What else is to be done with the cameras, their trees and the document.
     project : bool
         Whether the cameras of a file have no pose between them: one is read, or that which all are alike.
     write, whole : callable, optional
@@ -154,6 +161,12 @@ def table(
 
     def read(document: Document) -> CameraSet:
         found = parts(document)
+        cameras = in_poses(found)
+        if views is not None:
+            cameras = replace(cameras, poses=views(next(iter(found.values()))))
+        return cameras if finish is None else finish(cameras, found, document)
+
+    def in_poses(found: Mapping[str, Field]) -> CameraSet:
         if project:
             return only([keys.camera(part) for part in found.values()], found, keys.program)
         cameras = [keys.camera(part, name) for name, part in found.items()]
@@ -166,7 +179,8 @@ def table(
             poses = [STILL, *map(pose.read, list(found.values())[1:])]
         alone = pose is None or (getattr(pose, "from_first", False) and len(cameras) == 1)
         frame = getattr(pose, "frame", "body")
-        return mounted(cameras, poses, keys.program, None if alone else unit, frame)
+        stated = None if alone else unit(next(iter(found.values()))) if callable(unit) else unit
+        return mounted(cameras, poses, keys.program, stated, frame)
 
     def text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         assert write is not None

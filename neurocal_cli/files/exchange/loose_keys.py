@@ -1,9 +1,9 @@
 """Read a camera from a dictionary by the many names that programs and people give to its parts.
 
-The names may have that of one camera of two before or after them (``cameraMatrix1``, ``left_K``). Nothing is
-guessed: four coefficients that may be those of an ordinary lens or of a fisheye are refused, and so are
-numbers that may be the distortion and were not read, because a camera without its distortion looks right but
-is wrong.
+What is found gets the keys of `camera_names`, which the tables of formats have. The names may have that of
+one camera of two before or after them (``cameraMatrix1``, ``left_K``). Nothing is guessed: four coefficients
+that may be those of an ordinary lens or of a fisheye are refused, and so are numbers that may be the
+distortion and were not read, because a camera without its distortion looks right but is wrong.
 """
 
 from __future__ import annotations
@@ -14,35 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.given_values import checked_size
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.errors import InputError, one_line, value_failures
-from neurocal_cli.files.camera_tree import from_ros, matrix_data
+from neurocal_cli.errors import InputError, one_line
+from neurocal_cli.files.camera_tree import matrix_data
+from neurocal_cli.files.exchange.camera_keys import EIGHT
 from neurocal_cli.files.exchange.camera_names import (
     ALIKE,
-    ASPECT,
-    CENTRE,
-    COEFFICIENTS,
     ENTRIES,
-    FISHEYE,
-    FOCAL,
     HARMLESS,
-    HEIGHT,
-    KIND,
-    MATRIX,
-    MODEL,
-    NAME,
-    ORIGINAL,
-    RADIAL,
-    SHAPE,
-    SIZE,
-    TANGENTIAL,
+    NAMES,
     UNKNOWN,
-    WIDTH,
     flat,
     has_entries,
     have_gap,
@@ -58,8 +42,8 @@ from neurocal_cli.files.exchange.camera_names import (
 from neurocal_cli.files.exchange.document import NoCameraError, camera_matrix
 from neurocal_cli.files.tree_fields import Field
 
-# A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
 _ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
+# A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
 _LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
 
 
@@ -78,15 +62,18 @@ class LooseKeys:
         self.read: set[str] = set()
 
     def find(
-        self, names: Iterable[str], side: str = "", fits: Callable[[Any], bool] = lambda _: True
+        self,
+        key: str,
+        side: str = "",
+        fits: Callable[[Any], bool] = lambda _: True,
+        others: Iterable[str] = (),
     ) -> Field | None:
-        """Value of the first of these names that is there and fits; a second one that differs is refused."""
-        forms = [form for name in names for form in ((name + side, side + name) if side else (name,))]
+        """Value of the first name of a key that is there and fits; a second one that differs is refused."""
         keys = [
-            key
-            for form in dict.fromkeys(forms)
-            for key in self.names.get(form, [])
-            if key in self.root and fits(self.root.value[key])
+            name
+            for form in (*_forms(key, side), *others)
+            for name in self.names.get(form, [])
+            if name in self.root and fits(self.root.value[name])
         ]
         if not keys:
             return None
@@ -104,67 +91,60 @@ class LooseKeys:
         matrix = any(
             is_matrix(self.root.value[key])
             or (len(key) > 1 and (has_entries(self.root.value[key]) or is_four(self.root.value[key])))
-            for name in (*ORIGINAL, *MATRIX)
-            for form in ((name + side, side + name) if side else (name,))
+            for name in ("original_matrix", "camera_matrix")
+            for form in _forms(name, side)
             for key in self.names.get(form, [])
         )
         return matrix or (not side and has_entries(self.root.value))
 
-    def camera(self, side: str = "", name: str = "camera") -> Camera:
-        """Read the camera, or that of one side."""
-        inside = self.find(MATRIX, side, has_entries)
+    def tree(self, side: str = "") -> dict[str, Any]:
+        """The camera, or that of one side, under the keys of the table."""
+        inside = self.find("camera_matrix", side, has_entries)
         if inside is not None:  # it may hold the coefficients and the size as well
             own = {f"{key}_{side}" if side else key: value for key, value in inside.value.items()}
             if not own.keys() <= self.root.value.keys():
                 root = Field({**self.root.value, **own}, self.root.source)
                 merged = LooseKeys(root, self.distortion, self.notes)
-                camera = merged.camera(side, name)
+                tree = merged.tree(side)
                 self.read |= merged.read
                 self.coefficients_read |= merged.coefficients_read
                 merged.refuse_unread()
-                return camera
-        intrinsics = self._intrinsics(side)
-        distortion = self._distortion(side)
-        stated = self.find(NAME, side, lambda value: isinstance(value, (str, int)))
-        return Camera(
-            intrinsics, distortion, self.image_size(side), name if stated is None else stated.text()
-        )
+                return tree
+        K, lens = self._matrix(side), self._lens(side)
+        stated = self.find("camera_name", side, lambda value: isinstance(value, (str, int)))
+        size = self.image_size(side)
+        return {
+            "camera_name": "camera" if stated is None else stated.text(),
+            **({} if size is None else dict(zip(("image_width", "image_height"), size, strict=True))),
+            "camera_matrix": K.tolist(),
+            **lens,
+        }
 
     def image_size(self, side: str = "") -> tuple[int, int] | None:
         """Width and height [px]; None if they are unknown."""
-        sides = (side, "") if side else ("",)
-        width, height = (
-            next((field for s in sides if (field := self.find(names, s)) is not None), None)
-            for names in (WIDTH, HEIGHT)
-        )
-        field = next((f for s in sides if (f := self.find(SIZE, s)) is not None), None)
+
+        def find(key: str) -> Field | None:
+            found = (self.find(key, one) for one in dict.fromkeys((side, "")))
+            return next((field for field in found if field is not None), None)
+
+        width, height, field = map(find, ("image_width", "image_height", "image_size"))
         if width is not None and height is not None:
-            size = width.integer(), height.integer()
-            if field is not None and sorted(map(int, filter(np.isfinite, flat(field.value)))) not in (
-                [],
-                sorted(size),
-            ):
+            sides = width.integer(), height.integer()
+            stated = [] if field is None else [int(n) for n in flat(field.value) if np.isfinite(n)]
+            if field is not None and stated and sorted(stated) != sorted(sides):
                 self.root.refuse(f"{field.path} and {width.path}, {height.path} differ; remove one")
-        else:
-            turned = False
-            if field is None:
-                turned, field = True, self.find(SHAPE)
-            if field is None:
-                return None
-            if isinstance(field.value, dict) and not is_numbers(field.value):
-                return LooseKeys(field).image_size()
-            if isinstance(field.value, str):
-                numbers: list[float] = [int(n) for n in re.findall(r"\d+", field.value)]
-            else:
-                numbers = flat(field.value)
-            if len(numbers) != 2 and not (turned and len(numbers) == 3):
-                field.fail("two whole numbers, width and height")
-            values = [Field(n, field.source, field.path).integer() for n in numbers]
-            size = (values[1], values[0]) if turned else (values[0], values[1])
-        if 0 in size:
+            return None if 0 in sides else sides
+        turned = field is None
+        field = self.find("image_shape") if field is None else field
+        if field is None:
             return None
-        with value_failures(self.root.source):
-            return checked_size(size)
+        if isinstance(field.value, dict) and not is_numbers(field.value):
+            return LooseKeys(field).image_size()
+        numbers = re.findall(r"\d+", field.value) if isinstance(field.value, str) else flat(field.value)
+        if len(numbers) != 2 and not (turned and len(numbers) == 3):
+            field.fail("two whole numbers, width and height")
+        first, second = (Field(float(n), field.source, field.path).integer() for n in numbers[:2])
+        return None if 0 in (first, second) else (second, first) if turned else (first, second)
 
     def refuse_unread(self, every: bool = False) -> None:
         """Refuse numbers that may be the distortion and were not read; `every` number of a mapping of it."""
@@ -186,22 +166,18 @@ class LooseKeys:
                     f"{self.root.source}: {str(key)[:60]!r} looks like another camera matrix, and is not read"
                 )
 
-    def has_coefficients(self, side: str) -> bool:
-        """Whether there are distortion coefficients of the camera of a side."""
-        return self._coefficients(side)[0] is not None
-
     coefficients_read = False
     lacks = False  # a coefficient, beside others
 
-    def _intrinsics(self, side: str) -> Intrinsics:
-        field = self.find(ORIGINAL, side, is_matrix)
+    def _matrix(self, side: str) -> Array:
+        field = self.find("original_matrix", side, is_matrix)
         if field is None:
-            field = self.find(MATRIX, side, lambda value: is_matrix(value) or has_entries(value))
+            field = self.find("camera_matrix", side, lambda value: is_matrix(value) or has_entries(value))
         if field is None and not side and has_entries(self.root.value):
             field = self.root
-        if field is None:
+        if field is None:  # a damaged one
             field = self.find(
-                [n for n in MATRIX if len(n) > 1 or not side],
+                "camera_matrix",
                 side,
                 lambda v: not isinstance(v, dict) or not {"data", "rows"}.isdisjoint(v),
             )
@@ -230,7 +206,7 @@ class LooseKeys:
             raise InputError(
                 f"{field.path}: its last entry must be 1, found {K[2, 2]:g}; divide the matrix by it"
             )
-        four = [self.names[name][0] for names in ENTRIES for name in names if name in self.names]
+        four = [self.names[name][0] for key in ENTRIES for name in NAMES[key] if name in self.names]
         stated = [flat(self.root.value[key]) for key in four]
         if field is not self.root and not side and [len(one) for one in stated] == [1] * len(ENTRIES):
             shift = np.ravel(stated) - [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
@@ -238,28 +214,29 @@ class LooseKeys:
                 both = f"{field.path} and {', '.join(four)}"
                 self.root.refuse(f"{both} differ, and both may be meant; remove one")
         try:
-            return Intrinsics.from_matrix(K)
+            Intrinsics.from_matrix(K)
         except InputError as error:
             raise InputError(f"{field.path}: {error}; correct it") from error
+        return K
 
     def _of_entries(self) -> Array:
         """Camera matrix of fx, fy, cx, cy and the skew, or of the focal length and the principal point."""
-        found = [self.find(names, "", lambda v: not isinstance(v, (dict, list))) for names in ENTRIES]
+        found = [self.find(key, "", lambda v: not isinstance(v, (dict, list))) for key in ENTRIES]
         four = [entry.number() for entry in found if entry is not None]
         if len(four) < 4:
-            focal, centre = (self.find(names, "", is_numbers) for names in (FOCAL, CENTRE))
+            focal, centre = (self.find(key, "", is_numbers) for key in ("focal_length", "principal_point"))
             if focal is None:
-                stated = self.find(FOCAL)
+                stated = self.find("focal_length")
                 if stated is None:
                     self.root.refuse("has no focal length")
                 stated.fail("a number")
             own = four[-2:] if centre is None else flat(centre.value)
             four = [*(2 * flat(focal.value))[:2], *own]
             size = self.image_size()
-            ratio = self.find(ASPECT, "", is_numbers)
+            ratio = self.find("aspect_ratio", "", is_numbers)
             if ratio is None:
                 likely = [name for name in self.names if "aspect" in name or "ratio" in name]
-                ratio = self.find(likely, "", lambda v: isinstance(v, (int, float)))
+                ratio = self.find("", "", lambda v: isinstance(v, (int, float)), likely)
             if len(flat(focal.value)) == 1 and ratio is not None and ratio.number() not in (0, 1):
                 raise InputError(
                     f"has one focal length and {ratio.path}, which programs take as fy / fx or fx / fy; give "
@@ -269,30 +246,30 @@ class LooseKeys:
                 raise InputError(
                     f"{focal.path} is not told to be in pixels; give a file with fx, fy, cx and cy in pixels"
                 )
-        skew = self.find(("skew", "s"), "", is_numbers)
+        skew = self.find("skew", "", is_numbers)
         fx, fy, cx, cy = four
         return matrix_of(fx, fy, cx, cy, 0.0 if skew is None else skew.number())
 
     def _stated_model(self, side: str) -> str | None:
         """ROS's name of the distortion model that the file states; None if it states none."""
         stated: dict[str, str] = {}
-        inner = self.find(COEFFICIENTS, side, lambda value: isinstance(value, dict) and "data" not in value)
+        inner = self.find("distortion_coefficients", side, _is_mapping)
         if inner is not None and (model := LooseKeys(inner)._stated_model("")) is not None:
             stated[model] = inner.path
-        for names in (MODEL, KIND):
+        for key in ("distortion_model", "camera_model"):
             for s in dict.fromkeys((side, "")):
-                field = self.find(names, s, lambda value: isinstance(value, str))
+                field = self.find(key, s, lambda value: isinstance(value, str))
                 if field is None:
                     continue
-                word = field.text()
-                model = means(word) if word.strip() else "plumb_bob" if names is MODEL else None
-                if names is MODEL and model is None:
+                word, own = field.text(), key == "distortion_model"
+                model = means(word) if word.strip() else "plumb_bob" if own else None
+                if own and model is None:
                     model = "none" if plain(word) in ("none", "nodistortion") else word
                 if model is not None:
                     stated.setdefault(model, field.text())
                     break
-        for name in () if side and stated else FISHEYE:
-            field = self.find((name,), "", lambda v: v in (0, 1, True, False, "true", "false", "0", "1"))
+        for name in () if side and stated else NAMES["fisheye_model"]:
+            field = self.find(name, "", lambda v: v in (0, 1, True, False, "true", "false", "0", "1"))
             if field is not None:
                 yes = field.value in (1, True, "true", "1")
                 stated.setdefault("equidistant" if yes else "plumb_bob", f"{field.path} {field.value}")
@@ -305,116 +282,125 @@ class LooseKeys:
             return next((model for model in strong if model != "plumb_bob"), strong[0])
         return "plumb_bob" if stated else None
 
-    def _distortion(self, side: str) -> Distortion:
-        xi = self.find(("xi",), side, is_numbers)
-        coefficients, named = self._coefficients(side)
+    def _lens(self, side: str) -> dict[str, Any]:
+        """The distortion under the keys of the table."""
+        xi = self.find("xi", side, is_numbers)
+        k, named = self._coefficients(side)
         model = self._stated_model(side)
-        if model in ("double_sphere", "eucm") and coefficients is None:
-            found = [self.find((name,), side, is_numbers) for name in MODELS[model]]
+        if model in ("double_sphere", "eucm") and k is None:
+            found = [self.find(name, side, is_numbers) for name in MODELS[model]]
             if any(found) and not all(found):
                 raise InputError(
                     f"has not all of {', '.join(MODELS[model])}, the coefficients of {model}; add them"
                 )
             if all(found):
-                return Distortion(model, np.array([entry.number() for entry in found if entry]))
-        if coefficients is None:
+                return _lens(model, [entry.number() for entry in found if entry])
+        if k is None:
             self.lacks = model == UNKNOWN
             if xi is not None:
                 raise InputError(
                     "has xi of an omnidirectional camera without its distortion; add D, or zeros"
                 )
-            return Distortion()
+            return {"distortion_model": "none"}
         self.coefficients_read = True
-        if model == UNKNOWN:
-            if coefficients.any():
+        if model in (UNKNOWN, "none"):
+            if not any(k):
+                return _lens("none")
+            if model == UNKNOWN:
                 raise InputError(
                     "its distortion model is not known here; calibrate with OpenCV's model or its fisheye, "
                     "or with neurocal from the points"
                 )
-            return Distortion()
-        if model == "none":
-            if coefficients.any():
-                raise InputError("states that there is no distortion, and has coefficients of it; remove one")
-            return Distortion()
+            raise InputError("states that there is no distortion, and has coefficients of it; remove one")
         if xi is not None:
-            return _omnidirectional(xi, coefficients, "omnidir" if model is None else model)
+            return _omnidirectional(xi, k, "omnidir" if model is None else model)
         if model is None and self.distortion is not None:
-            return _given(self.distortion, coefficients)
-        if model is None and len(coefficients) == 4 and coefficients.any() and not named:
+            return _given(self.distortion, k)
+        if model is None and len(k) == 4 and any(k) and not named:
             raise InputError(
                 "has four distortion coefficients, and does not say whether they are k1, k2, p1, p2 of an "
                 "ordinary lens or k1 to k4 of a fisheye; convert it with --distortion k1k2p1p2 or fisheye"
             )
-        return Distortion(*from_ros(model or "plumb_bob", coefficients))
+        if model == "omnidir" and len(k) == len(MODELS[model]):
+            return {**_lens(model, k[1:]), "xi": k[0]}
+        return _lens(model or "plumb_bob", k)
 
-    def _coefficients(self, side: str) -> tuple[Array | None, bool]:
+    def _coefficients(self, side: str) -> tuple[list[float] | None, bool]:
         """Coefficients in OpenCV's order, and whether their names tell that p1 and p2 are among them."""
-        field = self.find(COEFFICIENTS, side, lambda v: not isinstance(v, (str, int, float)))
+        field = self.find("distortion_coefficients", side, lambda v: not isinstance(v, (str, int, float)))
         if field is not None:
-            if isinstance(field.value, dict) and "data" not in field.value:
+            if _is_mapping(field.value):
                 inner = LooseKeys(field)
                 found = inner._coefficients("")
                 inner.refuse_unread(every=True)
                 return found
-            return matrix_data(field, -1), False
-        radial, tangential = (self.find(names, side, is_numbers) for names in (RADIAL, TANGENTIAL))
+            return matrix_data(field, -1).tolist(), False
+        radial, tangential = (
+            self.find(f"{kind}_distortion", side, is_numbers) for kind in ("radial", "tangential")
+        )
         if radial is tangential is None and not side:  # mmpose and VoxelPose
-            radial, tangential = (
-                self.find((name,), "", counts)
-                for name, counts in (("k", lambda v: _count(v) in (2, 3, 6)), ("p", lambda v: _count(v) == 2))
-            )
+            radial = self.find("k", "", lambda v: _count(v) in (2, 3, 6))
+            tangential = self.find("p", "", lambda v: _count(v) == 2)
         if radial is None and tangential is not None and any(flat(tangential.value)):
             tangential.refuse(f"has {tangential.path}, and no radial coefficients under a known name")
         if radial is not None:
-            k = (
-                matrix_data(radial, -1)
-                if not isinstance(radial.value, (int, float))
-                else np.array([radial.number()])
-            )
+            single = isinstance(radial.value, (int, float))
+            k = [radial.number()] if single else matrix_data(radial, -1).tolist()
             if tangential is None and radial.path.rpartition(".")[2] in ("k", "K"):
                 radial.refuse("has k and no p; add p, the two tangential coefficients, or zeros")
-            p = np.zeros(2) if tangential is None else matrix_data(tangential, 2)
+            p = [0.0, 0.0] if tangential is None else matrix_data(tangential, 2).tolist()
             if len(k) not in (1, 2, 3, 6):
                 radial.fail("2, 3 or 6 numbers")
-            return np.array([*[*k, 0.0][:2], *p, *k[2:]]), True
-        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+            return [*[*k, 0.0][:2], *p, *(k[2:] or [0.0])], True
         values = {}
-        for name in names:
-            entry = self.find((name,), side, lambda v: is_numbers(v) and not isinstance(v, (list, dict)))
+        for name in EIGHT:
+            entry = self.find(name, side, lambda v: is_numbers(v) and not isinstance(v, (list, dict)))
             if entry is not None:
                 values[name] = entry.number()
         if not values:
             return None, False
         self.lacks = have_gap(values)
         if "k4" in values and not {"p1", "p2", "k5", "k6"} & set(values):  # as in a fisheye
-            return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
-        full = [values.get(name, 0.0) for name in names]
-        return np.array(full if any(full[5:]) else full[:5]), True
+            return [values.get(name, 0.0) for name in MODELS["fisheye"]], False
+        full = [values.get(name, 0.0) for name in EIGHT]
+        return full if any(full[5:]) else full[:5], True
+
+
+def _forms(key: str, side: str) -> list[str]:
+    """The plain names of a key, of one side before and after it."""
+    names = NAMES.get(key, (key,))
+    return [form for name in names for form in (name + side, side + name)] if side else [*names]
+
+
+def _is_mapping(value: Any) -> bool:
+    return isinstance(value, dict) and "data" not in value
 
 
 def _count(value: Any) -> int:
     return len(flat(value)) if isinstance(value, list) else 0
 
 
-def _omnidirectional(xi: Field, coefficients: Array, model: str) -> Distortion:
+def _lens(model: str, k: Iterable[float] = ()) -> dict[str, Any]:
+    return {"distortion_model": model, "distortion_coefficients": [*k]}
+
+
+def _omnidirectional(xi: Field, k: list[float], model: str) -> dict[str, Any]:
     """Distortion of OpenCV's omnidirectional camera, whose xi is a separate key."""
     value = xi.number() if isinstance(xi.value, (int, float)) else float(matrix_data(xi, 1)[0])
-    coefficients = coefficients[:4] if not coefficients[4:].any() else coefficients
-    if model != "omnidir" or len(coefficients) != 4:
+    k = k if any(k[4:]) else k[:4]
+    if model != "omnidir" or len(k) != 4:
         raise InputError(
-            f"has xi of an omnidirectional camera, and {len(coefficients)} coefficients of the distortion "
+            f"has xi of an omnidirectional camera, and {len(k)} coefficients of the distortion "
             f"model {model[:40]!r}; give k1, k2, p1, p2, and omnidir or no model"
         )
-    return Distortion("omnidir", np.array([value, *coefficients]))
+    return {**_lens(model, k), "xi": value}
 
 
-def _given(model: str, coefficients: Array) -> Distortion:
+def _given(model: str, k: list[float]) -> dict[str, Any]:
     """Coefficients of the model that the caller names, in OpenCV's order."""
-    names = MODELS[model]
-    fewest = len(names) if model in WIDE else 0
-    if len(coefficients) < fewest or coefficients[len(names) :].any():
+    count = len(MODELS[model])
+    if len(k) < (count if model in WIDE else 0) or any(k[count:]):
         raise InputError(
-            f"has {len(coefficients)} distortion coefficients, and {model} has {len(names)}; give another "
-            "--distortion"
+            f"has {len(k)} distortion coefficients, and {model} has {count}; give another --distortion"
         )
-    return Distortion(model, coefficients[: len(names)])
+    return _lens(model, [*k, *(count - len(k)) * [0.0]][:count])

@@ -21,14 +21,14 @@ import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange import dictionary
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_names import matrix_of
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
-from neurocal_cli.files.exchange.document import FROM_ZERO, Document, assignments
+from neurocal_cli.files.exchange.dictionary import OPENCV
+from neurocal_cli.files.exchange.document import Document, assignments
 from neurocal_cli.files.exchange.format_table import PoseKeys
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.tree_paths import numbers_at, under
+from neurocal_cli.files.exchange.tree_paths import arrays, numbers_at, under
 from neurocal_cli.files.tree_fields import Field
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
@@ -117,8 +117,10 @@ def read(document: Document) -> CameraSet:
             "holds points of Bouguet's toolbox, and no camera; give it to convert without --what"
         )
     if LooseKeys(root).has_camera():  # saved by Python, or of mexopencv
-        document.warnings.append(f"{document.source}: {FROM_ZERO}")
-        return dictionary.from_tree(root, document)
+        document = document.with_tree(root.value)
+        document.is_script = True
+        assert OPENCV.read is not None
+        return OPENCV.read(document)
     raise InputError(
         "holds no camera that can be read, and objects of MATLAB's classes can be read by MATLAB only; "
         "there, save a struct: cameraParams = toStruct(cameraParams); "
@@ -309,22 +311,10 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
             "ViewNames": np.array(list(cameras.poses), dtype=object),
         }
     if len(structs) == 1:
-        return {"": saved({"cameraParams": _arrays(structs[0])})}
+        return {"": saved({"cameraParams": arrays(structs[0])})}
     tree: dict[str, Any] = {f"CameraParameters{k}": one for k, one in enumerate(structs, start=1)}
     _SECOND.put(tree, cameras.relative[0])
-    return {"": saved({"stereoParams": _arrays(tree)})}
-
-
-def _arrays(tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree with matrices for lists; MATLAB's numbers are of double precision."""
-    return {
-        key: np.atleast_2d(np.array(value, dtype=float))
-        if isinstance(value, list)
-        else _arrays(value)
-        if isinstance(value, dict)
-        else value
-        for key, value in tree.items()
-    }
+    return {"": saved({"stereoParams": arrays(tree)})}
 
 
 FORMAT = Format(

@@ -31,7 +31,6 @@ from neurocal_cli.files.exchange import (
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, adapt_cameras, after, inverse
 from neurocal_cli.files.exchange.document import UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.neurocal import camera_set
-from neurocal_cli.files.tree_fields import Field
 
 # Formats that `convert` writes, by the values of its option ``--to``.
 FORMATS: dict[str, Format] = {
@@ -106,6 +105,7 @@ READ: tuple[Format, ...] = (
     photographs.GYROFLOW,
     photographs.OPEN3D,
     ros.FORMAT,
+    dictionary.MULTIVIEW,
     dictionary.OPENCV,
 )
 
@@ -282,10 +282,8 @@ def read_cameras(
         if len(names) == 1:
             return cameras[0]
     documents = [Document(name, *told, distortion, size) for name in names]
-    if len(documents) == 2 and "-" not in names:
-        merged = _merged(documents)
-        if merged is not None:
-            return merged
+    if len(documents) == 2 and "-" not in names and (merged := _merged(documents)) is not None:
+        documents = [merged]
     cameras = [_read(document) for document in documents]
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
 
@@ -364,22 +362,18 @@ def _nearest(document: Document) -> str:
     return f"; of the known formats {one.program} is the nearest, which has {', '.join(lacks[:4])} as well"
 
 
-def _merged(documents: Sequence[Document]) -> CameraSet | None:
-    """The camera or the rig of two files with a part each; None if they have none."""
+def _merged(documents: Sequence[Document]) -> Document | None:
+    """The two files of a camera or a rig that have a part of it each as one; None for others."""
     first, second = documents
-    source = f"{first.source}, {second.source}"
     arrays = [document.array for document in documents if document.array is not None]
     if len(arrays) == 2:
         matrix = next((k for k, array in enumerate(arrays) if array.shape == (3, 3)), 0)
         tree = {"K": arrays[matrix].tolist(), "D": arrays[1 - matrix].ravel().tolist()}
-    elif all(map(capture.easymocap_names, documents)):
-        return capture.EASYMOCAP.read(first.joined(second)) if capture.EASYMOCAP.read else None
-    elif all(map(dictionary.is_part, documents)):
+    elif all(map(capture.easymocap_names, documents)) or all(map(dictionary.is_part, documents)):
         tree = {**first.tree, **second.tree}
     else:
         return None
-    with value_failures(source):
-        return dictionary.from_tree(Field(tree, source), first)
+    return first.with_tree(tree, f"{first.source}, {second.source}")
 
 
 def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:

@@ -7,6 +7,7 @@ cameras parallel. Therefore R = R2^T R1 and t = R2^T (P2[0, 3], P2[1, 3], 0) / f
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -16,15 +17,17 @@ from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import format_camera_info, matrix_data
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format
-from neurocal_cli.files.exchange.dictionary import note_size
+from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.dictionary import KEYS, with_sizes_noted
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.format_table import table
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field, is_number
 
 _TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)  # of ost.txt
 # The lines above the numbers, our keys of these, and how many there are.
+_RECTIFIED = {"rectification_matrix": 9, "projection_matrix": 12}
 _BLOCKS = {
     "width": ("image_width", 1), "height": ("image_height", 1), "camera matrix": ("camera_matrix", 9),
     "distortion": ("distortion_coefficients", -1), "rectification": ("rectification_matrix", 9),
@@ -41,26 +44,27 @@ def matches(document: Document) -> object:
     return info or (message and "distortion_model" in tree) or _TEXT.search(document.text[:5000])
 
 
-def read(document: Document) -> CameraSet:
-    """Read the camera, with its pose in a rectified pair if it has one."""
+def _parts(document: Document) -> dict[str, Field]:
     root = _ost(document) if _TEXT.search(document.text[:5000]) else document.root
     keys = LooseKeys(root, document.distortion, document.notes)
-    camera = keys.camera()
-    R, P = (
-        keys.find((long, short)) for long, short in (("rectificationmatrix", "r"), ("projectionmatrix", "p"))
-    )
+    tree = keys.tree()
+    for key, count in _RECTIFIED.items():
+        if (found := keys.find(key)) is not None:
+            tree[key] = matrix_data(found, count).tolist()
     keys.refuse_unread()
-    note_size(camera, document)
-    rectified = None
-    if P is not None:
-        rotation = np.eye(3) if R is None else matrix_data(R, 9).reshape(3, 3)
-        projection = matrix_data(P, 12).reshape(3, 4)
-        # ROS's drivers write zeros where nothing is known.
-        if projection[0, 0] > 0 and projection[1, 1] > 0:
-            rectified = rotation if rotation.any() else np.eye(3), projection
     if root.get("binning_x", 0).integer() > 1 or root.get("binning_y", 0).integer() > 1:
         document.notes.append(f"{document.source}: has binning; the camera is that of the images before it")
-    return CameraSet((camera,), (), {}, "m", program="ROS", rectified=rectified)
+    return {"camera": Field(tree, document.source)}
+
+
+def _with_rectification(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
+    """The camera with its pose in a rectified pair, if the file has one."""
+    found = with_sizes_noted(replace(found, unit="m"), parts, document)
+    R, P = (np.array(parts["camera"].get(key).value, dtype=float) for key in _RECTIFIED)
+    if P.size != 12 or P[0] <= 0 or P[5] <= 0:  # ROS's drivers write zeros where nothing is known
+        return found
+    rotation = R.reshape(3, 3) if R.size == 9 and R.any() else np.eye(3)
+    return replace(found, rectified=(rotation, P.reshape(3, 4)))
 
 
 def _ost(document: Document) -> Field:
@@ -121,13 +125,16 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
 
 
-FORMAT = Format(
-    "ROS",
-    ("none", "plumb_bob", "rational", "fisheye"),
-    _text,
+FORMAT = table(
+    replace(KEYS, program="ROS"),
     matches,
-    read,
-    files="camera_info YAML, a message printed by rostopic echo, ost.txt, ost.ini",
+    "camera_info YAML, a message printed by rostopic echo, ost.txt, ost.ini",
+    parts=_parts,
+    finish=_with_rectification,
+    text=_text,
+    models=("none", "plumb_bob", "rational", "fisheye"),
+    marks=frozenset(),
+    most_cameras=2,
     metres=True,
     needs_size=True,
     rectified=True,

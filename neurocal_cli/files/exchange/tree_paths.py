@@ -118,6 +118,18 @@ def in_order(table: str, words: Any, source: str) -> Field:
     return Field(tree, source)
 
 
+def arrays(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The tree with matrices of doubles for lists of numbers."""
+    return {
+        key: np.atleast_2d(np.array(value, dtype=float))
+        if isinstance(value, list)
+        else arrays(value)
+        if isinstance(value, dict)
+        else value
+        for key, value in tree.items()
+    }
+
+
 def json_text(tree: Any) -> str:
     """A tree as JSON."""
     return json.dumps(tree, indent=1, allow_nan=False) + "\n"
