@@ -275,10 +275,10 @@ def counting_views(
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
             moves = moves @ back.T
-        jackknife = _jackknife(q.moves_without_each() if moves is None else moves)
+        found_by_views = jackknife(q.moves_without_each() if moves is None else moves)
         noise = _expected(q, repeated.variance, variance)
-        if contradict or _size(jackknife, entries) > grown * _size(noise, entries):
-            entries = _at_least(jackknife, entries)
+        if contradict or _size(found_by_views, entries) > grown * _size(noise, entries):
+            entries = not_smaller(entries, found_by_views)
     if entries is before or not np.isfinite(entries).all():
         return found
     if told is not None:
@@ -342,8 +342,8 @@ def _contradict(q: Quadratics, variance: float) -> bool:
     return bool(statistic > exceeded_by_chance(mean**2 / spread, _CHANCE))
 
 
-def _jackknife(moves: Array) -> Array:
-    """(f, f) jackknife covariance from the moves (P, f) without each pose; nan if a pose is indispensable."""
+def jackknife(moves: Array) -> Array:
+    """(f, f) jackknife covariance from the moves (P, f) without each part; nan if one is indispensable."""
     moves = moves - moves.mean(axis=0)
     return np.asarray((len(moves) - 1) / len(moves) * moves.T @ moves)
 
@@ -369,16 +369,25 @@ def _size(jackknife: Array, entries: Array) -> float:
     return float(np.trace(solve_or_nan(entries, jackknife))) / len(entries)
 
 
-def _at_least(jackknife: Array, entries: Array) -> Array:
-    """The jackknife's covariance, raised to the other one in every direction in which it is smaller."""
-    scaled, scale = unit_diagonal(entries)
+def not_smaller(least: Array, other: Array) -> Array:
+    """The smallest covariance that is, in the axes that both share, nowhere smaller than either.
+
+    It is the first one where the other is not finite, or the first is singular.
+
+    Examples
+    --------
+    >>> not_smaller(np.diag([1.0, 4.0]), np.diag([3.0, 1.0])).round(9)
+    array([[3., 0.],
+           [0., 4.]])
+    """
+    scaled, scale = unit_diagonal(least)
     try:
         root = np.linalg.cholesky(scaled) / scale[:, None]
         inverse = np.linalg.inv(root)
-        values, vectors = np.linalg.eigh(inverse @ jackknife @ inverse.T)
+        values, vectors = np.linalg.eigh(inverse @ other @ inverse.T)
     except np.linalg.LinAlgError:  # nan among them too
-        return entries
+        return least
     if not np.isfinite(values).all():
-        return entries
+        return least
     axes = root @ vectors
     return np.asarray(axes * np.maximum(values, 1.0) @ axes.T)

@@ -114,6 +114,12 @@ class Arrowhead:
         M = N[:, columns[:, None], columns]
         return cls(M[:, p:, p:].sum(axis=0), M[:, :p, :p], M[:, :p, p:])
 
+    @classmethod
+    def alone(cls, H: Array, g: Array, cost: float) -> Arrowhead:
+        """Of shared unknowns alone, from their matrix (s, s), right side (s,) and the sum of squares."""
+        shared = np.block([[H, g[:, None]], [g, np.array(cost)]])
+        return cls(shared, np.zeros((0, 0, 0)), np.zeros((0, 0, len(shared))))
+
     @property
     def cost(self) -> float:
         """The sum of squares."""

@@ -143,7 +143,7 @@ def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
     whole = calibrate(points, **options)
     others = [calibrate(points.select(points.view_index != k), **options) for k in range(10)]
     m = _AtMinimum(whole)
-    told = covariance_module._jackknife(reduced(m.normal, m.free, True).moves_without_each())
+    told = covariance_module.jackknife(reduced(m.normal, m.free, True).moves_without_each())
     alphas = np.array([c.intrinsics.alpha_u for c in others])
     jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())
     assert np.sqrt(told[0, 0]) * m.views.pixel_scale == pytest.approx(jackknife, rel=0.05)
@@ -160,7 +160,7 @@ def test_the_jackknife_of_noise_is_as_expected() -> None:
         g = (np.swapaxes(J, 1, 2) @ (sigma * rng.standard_normal((V, rows, 1))))[..., 0]
         g -= S @ np.linalg.solve(S.sum(axis=0), g.sum(axis=0))
         moves = Quadratics(S, g, np.zeros(V)).moves_without_each()
-        total += covariance_module._jackknife(moves) / draws
+        total += covariance_module.jackknife(moves) / draws
     expected = covariance_module._expected(Quadratics(S, np.zeros((V, 4)), np.zeros(V)), np.ones(V), sigma**2)
     plain = sigma**2 * np.linalg.inv(S.sum(axis=0))
     # The last view has half of the information.

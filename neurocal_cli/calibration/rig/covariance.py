@@ -31,14 +31,8 @@ from neurocal_cli.adjustment.board.information import Information, point_terms
 from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
-from neurocal_cli.adjustment.covariance import entry_covariance
-from neurocal_cli.adjustment.normal_equations import (
-    ROUNDING,
-    Arrowhead,
-    SchurCovariance,
-    solve_scaled,
-    unit_diagonal,
-)
+from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
+from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SchurCovariance, solve_scaled
 from neurocal_cli.adjustment.open_choices import (
     OpenCoefficients,
     OpenPrior,
@@ -107,33 +101,12 @@ def covariance_over_frames(fit: RigFit) -> Array:
             whole[:, column] = 1.0
             parts[:, :, k] = of_frames(whole)
         moves = solve_scaled(S - parts, -scores[..., None], ROUNDING)[..., 0]
-        moves = moves[np.isfinite(moves).all(axis=1)]
     else:
         moves = -scores @ inverse
         for _ in range(_ROUNDS):
             whole[:, free], whole[:, -1] = moves, 0.0
             moves = (of_frames(whole) - scores) @ inverse
-    spread = moves - moves.mean(axis=0)
-    return np.asarray((len(moves) - 1) / len(moves) * spread.T @ spread)
-
-
-def not_smaller(least: Array, other: Array) -> Array:
-    """The smallest covariance that is, in the axes that both share, nowhere smaller than either.
-
-    Examples
-    --------
-    >>> not_smaller(np.diag([1.0, 4.0]), np.diag([3.0, 1.0])).round(9)
-    array([[3., 0.],
-           [0., 4.]])
-    """
-    scaled, scale = unit_diagonal(least)
-    values, axes = np.linalg.eigh(scaled)
-    root = axes * np.sqrt(np.maximum(values, 1e-15))
-    inverse = (axes / np.sqrt(np.maximum(values, 1e-15))).T
-    ratio, turn = np.linalg.eigh(inverse @ (other * scale[:, None] * scale) @ inverse.T)
-    joint = root @ turn
-    larger = (joint * np.maximum(ratio, 1.0)) @ joint.T
-    return np.asarray(larger / scale[:, None] / scale)
+    return jackknife(moves[np.isfinite(moves).all(axis=1)])
 
 
 def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.covariance import not_smaller
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
 from neurocal_cli.calibration.rig.assessment import assess_rig
@@ -22,7 +23,6 @@ from neurocal_cli.calibration.rig.contradictions import LeftOut, told_left_out, 
 from neurocal_cli.calibration.rig.covariance import (
     contradicting_covariance,
     covariance_of_stretch,
-    not_smaller,
     with_target_uncertainty,
 )
 from neurocal_cli.calibration.rig.edges import (

@@ -9,14 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import parameter_covariance, parameter_warnings, pose_std, with_scale
+from neurocal_cli.adjustment.covariance import (
+    not_smaller,
+    parameter_covariance,
+    parameter_warnings,
+    pose_std,
+    with_scale,
+)
 from neurocal_cli.adjustment.normal_equations import SchurCovariance, solve_scaled
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
-from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice, not_smaller
+from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose

@@ -21,14 +21,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
-from neurocal_cli.adjustment.normal_equations import ROUNDING, damped_step, eliminate, solve_scaled
+from neurocal_cli.adjustment.normal_equations import (
+    ROUNDING,
+    Arrowhead,
+    SharedAndOwn,
+    eliminate,
+    solve_scaled,
+)
 from neurocal_cli.adjustment.problem import translations, translations_normalised
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views, arrange
@@ -186,6 +192,11 @@ class Normal:
     cost: Array  # (S,) sum of squared residuals [px^2]
     sensible: bool  # whether all points are in front of the camera, where the distortion is monotonic
 
+    @classmethod
+    def of(cls, blocks: Array, sensible: bool) -> Normal:
+        """From `blocks`."""
+        return cls(blocks[:, :-1, :-1], blocks[:, :-1, -1], blocks[:, -1, -1], sensible)
+
     @property
     def blocks(self) -> Array:
         """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
@@ -266,14 +277,13 @@ class PixelData:
             reduced = self._chain(N, local, constants) if self.still else self._eliminate(N, local, constants)
         summed = np.zeros((self.n_settings, *reduced.shape[1:]))
         np.add.at(summed, self.setting, reduced)
-        L = summed.shape[1] - 1
         if not self.free_theta:  # a unit diagonal holds it at 0
             theta = len(self.names)
             summed[:, theta, :] = summed[:, :, theta] = 0.0
             summed[:, theta, theta] = 1.0
         summed = symmetric(summed)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
-        return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
+        return Normal.of(summed, good), constants
 
     def state_of(self, local: Array, constants: Constants) -> CameraState:
         """Normalised cameras of all views."""
@@ -386,40 +396,18 @@ class QuadraticError:
 
     def minimum(self, model: Model, shared: Array, options: DescentOptions) -> tuple[Model, Array, float]:
         """The model and the constants' step at the minimum, and 2 E there."""
-        problem = _Problem(self, model, shared)
+
+        def linearised(model: Model, shared: Array) -> tuple[Model, Array, Arrowhead]:
+            return model, shared, Arrowhead.alone(*self.system(model, shared), self.cost(model, shared))
+
+        def moved(at: tuple[Model, Array, Arrowhead], step: Array, _: Array) -> tuple[Any, bool]:
+            weights, constants = np.split(step, [len(step) - len(shared)])
+            return linearised(at[0].moved(weights), at[1] + constants), True  # all weights are valid
+
+        problem = SharedAndOwn(linearised(model, shared), lambda at: at[2], moved)
         minimise(problem, options)
-        return problem.model, problem.shared, float(problem.cost[0])
-
-
-class _Problem(Generic[Model]):
-    """2 E as a problem of `minimise` with one group."""
-
-    def __init__(self, error: QuadraticError, model: Model, shared: Array) -> None:
-        self.error, self.model, self.shared = error, model, shared
-        self.cost = np.array([error.cost(model, shared)])
-        self.N, self.downhill = error.system(model, shared)
-
-    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Damped step of all weights and the constants, and the predicted gain."""
-        step, promised = damped_step(self.N[None].copy(), self.downhill[None], damping)
-        return step[0], promised
-
-    def move(
-        self, step: Array, active: NDArray[np.intp]
-    ) -> tuple[tuple[Model, Array, Array], Array, NDArray[np.bool_]]:
-        """The model after a step; all weights are valid."""
-        P = len(step) - len(self.shared)
-        model, shared = self.model.moved(step[:P]), self.shared + step[P:]
-        cost = np.array([self.error.cost(model, shared)])
-        return (model, shared, cost), cost, np.ones(1, dtype=bool)
-
-    def accept(
-        self, trial: tuple[Model, Array, Array], better: NDArray[np.bool_], active: NDArray[np.intp]
-    ) -> None:
-        """Accept the trial."""
-        if better[0]:
-            self.model, self.shared, self.cost = trial
-            self.N, self.downhill = self.error.system(self.model, self.shared)
+        model, shared, normal = problem.state
+        return model, shared, normal.cost
 
 
 def gauss_newton(J: Array, H: Array, prior: Array) -> Array:
@@ -452,15 +440,6 @@ def with_scatter(normal: Normal, scatter: Array, variance: float) -> Normal:
     """
     if not scatter.any():
         return normal
-    some = np.flatnonzero(scatter)
-    B = normal.H[:, some[:, None], some] + variance * np.diag(1 / scatter[some])
-    cross = normal.H[:, some]
-    gain = np.swapaxes(solve_scaled(B, cross, ROUNDING), 1, 2)
-    pull = normal.g[:, some]
-    solved = solve_scaled(B, pull[..., None], ROUNDING)[..., 0]
-    return replace(
-        normal,
-        H=normal.H - gain @ cross,
-        g=normal.g - (gain @ pull[..., None])[..., 0],
-        cost=normal.cost - (solved * pull).sum(axis=1),
-    )
+    some, N = np.flatnonzero(scatter), normal.blocks
+    B, cross = N[:, some[:, None], some] + variance * np.diag(1 / scatter[some]), N[:, some]
+    return Normal.of(N - np.swapaxes(cross, 1, 2) @ solve_scaled(B, cross, ROUNDING), normal.sensible)
