@@ -232,6 +232,7 @@ def parameter_warnings(
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
+_ROUNDING = 1e-15  # least eigenvalue of a covariance with unit diagonal
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
 
 
@@ -372,7 +373,7 @@ def _size(jackknife: Array, entries: Array) -> float:
 def not_smaller(least: Array, other: Array) -> Array:
     """The smallest covariance that is, in the axes that both share, nowhere smaller than either.
 
-    It is the first one where the other is not finite, or the first is singular.
+    It is the first one if the other is not finite.
 
     Examples
     --------
@@ -382,12 +383,13 @@ def not_smaller(least: Array, other: Array) -> Array:
     """
     scaled, scale = unit_diagonal(least)
     try:
-        root = np.linalg.cholesky(scaled) / scale[:, None]
-        inverse = np.linalg.inv(root)
-        values, vectors = np.linalg.eigh(inverse @ other @ inverse.T)
+        values, axes = np.linalg.eigh(scaled)
+        root = np.sqrt(np.maximum(values, _ROUNDING))
+        inverse = axes / root * scale[:, None]
+        values, turn = np.linalg.eigh(inverse.T @ other @ inverse)
     except np.linalg.LinAlgError:  # nan among them too
         return least
     if not np.isfinite(values).all():
         return least
-    axes = root @ vectors
-    return np.asarray(axes * np.maximum(values, 1.0) @ axes.T)
+    joint = (axes * root / scale[:, None]) @ turn
+    return np.asarray(joint * np.maximum(values, 1.0) @ joint.T)

@@ -130,6 +130,19 @@ class Arrowhead:
         columns = np.append(kept, len(self.shared) - 1)
         return Arrowhead(self.shared[np.ix_(columns, columns)], self.own, self.cross[:, :, columns])
 
+    def around(self, right: Array, by_shared: Array, more: float) -> Arrowhead:
+        """The same around other values of further unknowns, or of some of the own ones, after a move of -d.
+
+        `right` (V, p) is their coupling to the own unknowns times d, `by_shared` (s + 1,) likewise that to
+        the shared ones and their right side, and `more` is d^T H d.
+        """
+        shared, cross = self.shared.copy(), self.cross.copy()
+        shared[-1] += by_shared
+        shared[:, -1] += by_shared
+        shared[-1, -1] += more
+        cross[:, :, -1] += right
+        return Arrowhead(shared, self.own, cross)
+
     def reduced(self) -> tuple[Array, Array]:
         """The own unknowns eliminated: the Schur complement (s + 1, s + 1), and their response (V, p, s + 1).
 

@@ -23,6 +23,7 @@ from neurocal_cli.adjustment.board.posterior import (
 )
 from neurocal_cli.adjustment.board.prior import Prior, coordinates_of, prior_of
 from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst
+from neurocal_cli.adjustment.normal_equations import Arrowhead
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.calibration.calibration import Calibration
@@ -82,7 +83,7 @@ def test_the_quadratic_is_that_of_the_squared_error() -> None:
     state = normalised(in_pixels(problem, adjusted.state), moved.views)
     normal, _ = normal_blocks(moved.views.batches, state)
     cost = normal[:, -1, -1].sum() * moved.views.pixel_scale**2
-    promised = info.cost + (d * ((info.point @ d[..., None])[..., 0] - 2 * info.point_right)).sum()
+    promised = info.cost + (d * ((info.point @ d[..., None])[..., 0] - 2 * info.by_camera[..., -1])).sum()
     assert abs(promised - cost) < 1e-3 * abs(info.cost - cost)
 
 
@@ -160,27 +161,29 @@ def test_the_folds_of_the_views_sum_up_to_all() -> None:
         parts = folded.parts(folded.whole, lambda info: info)
         for k, part in enumerate(parts):
             own = information_of([sight.of_views(np.arange(k, 7, 3))], 63)
-            for field in fields(Information):
-                a, b = getattr(part, field.name), getattr(own, field.name)
+            blocks = [(part.cameras, own.cameras, field.name) for field in fields(Arrowhead)]
+            blocks += [(part, own, field.name) for field in fields(Information) if field.name != "cameras"]
+            for one, other, name in blocks:
+                a, b = getattr(one, name), getattr(other, name)
                 np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0))
         whole = information_of([sight], 63)
         assert joined(parts).cost == pytest.approx(whole.cost)
-        np.testing.assert_allclose(joined(parts).point_camera, whole.point_camera, rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(joined(parts).by_camera, whole.by_camera, rtol=1e-9, atol=1e-6)
 
 
 def test_the_posterior_is_that_of_the_whole_dense_system() -> None:
     info, prior = equations(photographed("parabola", 3, 4)[0])
     found = known_sizes(info, prior, SIZES, 0.04)
-    f, P, n = len(info.camera), len(info.pose), len(info.point)
+    f, P, n = len(info.cameras.shared) - 1, len(info.cameras.own), len(info.point)
     H = np.zeros((f + 6 * P + 3 * n,) * 2)
     c, q, d = slice(0, f), slice(f, f + 6 * P), slice(f + 6 * P, None)
-    H[c, c] = info.camera
-    H[q, c] = info.pose_camera.reshape(-1, f)
-    H[d, c] = info.point_camera.reshape(-1, f)
+    H[c, c] = info.cameras.shared[:-1, :-1]
+    H[q, c] = info.cameras.cross[:, :, :-1].reshape(-1, f)
+    H[d, c] = info.by_camera[..., :-1].reshape(-1, f)
     H[d, q] = info.pose_point.reshape(6 * P, 3 * n).T
     for k in range(P):
         at = slice(f + 6 * k, f + 6 * k + 6)
-        H[at, at] = info.pose[k]
+        H[at, at] = info.cameras.own[k]
     covariance = np.zeros((3 * n, 3 * n))
     for name, places in prior.groups.items():
         basis = prior.basis.reshape(3 * n, -1)[:, places] * (SIZES[name] / prior.size)
@@ -192,7 +195,8 @@ def test_the_posterior_is_that_of_the_whole_dense_system() -> None:
         points[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = info.point[k]
     H[d, d] = points + 0.04 * np.linalg.inv(covariance)
     H = np.tril(H) + np.tril(H, -1).T
-    right = np.concatenate([info.camera_right, info.pose_right.ravel(), info.point_right.ravel()])
+    right = [info.cameras.shared[:-1, -1], info.cameras.cross[:, :, -1].ravel()]
+    right = np.concatenate([*right, info.by_camera[..., -1].ravel()])
     inverse = np.linalg.inv(H)
     np.testing.assert_allclose(found.offsets.ravel(), (inverse @ right)[d], rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(found.camera, inverse[c, c], rtol=1e-5)

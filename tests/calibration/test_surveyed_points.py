@@ -46,13 +46,15 @@ def system(n_views: int) -> tuple[Information, Prior]:
 
 def test_the_covariances_are_those_of_the_whole_dense_system(monkeypatch: pytest.MonkeyPatch) -> None:
     info, prior = system(3)
-    f, P, n = len(info.camera), len(info.pose), len(info.point)
+    f, P, n = len(info.cameras.shared) - 1, len(info.cameras.own), len(info.point)
     H = np.zeros((f + 6 * P + 3 * n,) * 2)
     c, q, d = slice(0, f), slice(f, f + 6 * P), slice(f + 6 * P, None)
-    H[c, c], H[q, c], H[d, c] = info.camera, info.pose_camera.reshape(-1, f), info.point_camera.reshape(-1, f)
+    H[c, c] = info.cameras.shared[:-1, :-1]
+    H[q, c] = info.cameras.cross[:, :, :-1].reshape(-1, f)
+    H[d, c] = info.by_camera[..., :-1].reshape(-1, f)
     H[d, q] = info.pose_point.reshape(6 * P, 3 * n).T
     for k in range(P):
-        H[f + 6 * k : f + 6 * k + 6, f + 6 * k : f + 6 * k + 6] = info.pose[k]
+        H[f + 6 * k : f + 6 * k + 6, f + 6 * k : f + 6 * k + 6] = info.cameras.own[k]
     for k in range(n):
         at = slice(f + 6 * P + 3 * k, f + 6 * P + 3 * k + 3)
         H[at, at] = info.point[k] + 0.09 * np.diag((2 * prior.stated[k]) ** -2)

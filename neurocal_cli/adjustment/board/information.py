@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.normal_equations import Arrowhead
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, derivatives, free_columns, put_displaced
 from neurocal_cli.adjustment.views import PointBatches, Views, batches_of, products
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -66,9 +67,6 @@ def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
     return np.concatenate([POSE_COLUMNS, last])
 
 
-_OF_POSES = ("pose", "pose_camera", "pose_right", "pose_point")  # blocks with an axis for the poses
-
-
 @frozen_dataclass(eq=False)
 class Sight:
     """Observations of the target, at its current world coordinates, by one camera.
@@ -114,76 +112,64 @@ class Sight:
 class Information:
     """Blocks of the normal matrix and the right side: sums of products of derivatives and residuals [px].
 
-    The camera blocks are those of the free parameters of all cameras in sequence, each in its normalised
-    units. With a bend in each view, a pose has p = 9 unknowns: its six, and the three coefficients of the
-    view's whole bend. Otherwise p = 6. The points' unknowns are offsets in the world's axes and unit.
+    The shared unknowns of `cameras` are the free parameters of all cameras in sequence, each in its
+    normalised units, and the own ones are the poses. With a bend in each view, a pose has p = 9 unknowns: its
+    six, and the three coefficients of the view's whole bend. Otherwise p = 6. The points' unknowns are
+    offsets in the world's axes and unit.
     """
 
-    camera: Array  # (f, f)
-    camera_right: Array  # (f,)
-    pose: Array  # (P, p, p)
-    pose_camera: Array  # (P, p, f)
-    pose_right: Array  # (P, p)
+    cameras: Arrowhead  # of f parameters and P poses, for given points
     point: Array  # (n, 3, 3)
-    point_camera: Array  # (n, 3, f)
-    point_right: Array  # (n, 3)
+    by_camera: Array  # (n, 3, f + 1) coupling of the points to the cameras, and their right sides
     pose_point: Array  # (P, p, n, 3)
-    cost: float  # sum of squares
     equations: float
     log_precision: float = 0.0  # sum of the logarithms of the prior precisions of the bends; see `held`
 
     @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return self.cameras.cost
+
+    @property
     def spare(self) -> float:
         """Degrees of freedom: equations minus the unknowns of cameras and poses."""
-        return self.equations - len(self.camera) - 6 * len(self.pose)
+        return self.equations - (len(self.cameras.shared) - 1) - 6 * len(self.pose_point)
 
     def held(self, precision: float) -> Information:
         """Add a Gaussian prior of this precision, in units of the noise precision, on the bends."""
-        pose, bends = self.pose.copy(), np.arange(6, self.pose.shape[1])
-        pose[:, bends, bends] += precision
-        return replace(self, pose=pose, log_precision=len(pose) * len(bends) * np.log(precision))
+        own, bends = self.cameras.own.copy(), np.arange(6, self.pose_point.shape[1])
+        own[:, bends, bends] += precision
+        logarithm = len(own) * len(bends) * np.log(precision)
+        return replace(self, cameras=replace(self.cameras, own=own), log_precision=logarithm)
 
     def around_straight(self, bends: Array) -> Information:
         """The same quadratic in the whole bends (P, 3) instead of their changes."""
-        by_pose = (self.pose[:, :, 6:] @ bends[..., None])[..., 0]
-        cost = 2 * self.pose_right[:, 6:] + by_pose[:, 6:]
-        return replace(
-            self,
-            camera_right=self.camera_right + np.einsum("pkf,pk->f", self.pose_camera[:, 6:], bends),
-            pose_right=self.pose_right + by_pose,
-            point_right=self.point_right + np.einsum("pkni,pk->ni", self.pose_point[:, 6:], bends),
-            cost=self.cost + float((bends * cost).sum()),
-        )
+        by_pose = (self.cameras.own[:, :, 6:] @ bends[..., None])[..., 0]
+        by_shared = np.einsum("pks,pk->s", self.cameras.cross[:, 6:], bends)
+        by_camera = self.by_camera.copy()
+        by_camera[..., -1] += np.einsum("pkni,pk->ni", self.pose_point[:, 6:], bends)
+        more = float((bends * by_pose[:, 6:]).sum())
+        return replace(self, cameras=self.cameras.around(by_pose, by_shared, more), by_camera=by_camera)
 
     def with_poses_of(self, other: Information, which: NDArray[np.bool_] | slice) -> Information:
         """The same sums, with the blocks of some poses (P,) of another."""
-        return replace(self, **{name: getattr(other, name)[which] for name in _OF_POSES})
+        cameras = replace(self.cameras, own=other.cameras.own[which], cross=other.cameras.cross[which])
+        return replace(self, cameras=cameras, pose_point=other.pose_point[which])
 
     def of_cameras(self, kept: NDArray[np.bool_]) -> Information:
         """The quadratic in some parameters (f,) of the cameras, where the others are held."""
-        return replace(
-            self,
-            camera=self.camera[np.ix_(kept, kept)],
-            camera_right=self.camera_right[kept],
-            pose_camera=self.pose_camera[:, :, kept],
-            point_camera=self.point_camera[:, :, kept],
-        )
+        by_camera = self.by_camera[:, :, np.append(kept, True)]
+        return replace(self, cameras=self.cameras.only(np.flatnonzero(kept)), by_camera=by_camera)
 
     def pose_by(self, offsets: Array) -> Array:
         """(P, p) contribution of offsets (n, 3) to the right side of the poses."""
-        P, p = self.pose.shape[:2]
+        P, p = self.pose_point.shape[:2]
         return (self.pose_point.reshape(P * p, offsets.size) @ offsets.ravel()).reshape(P, p)
 
     def straight(self) -> Information:
         """The quadratic without bends."""
-        return replace(
-            self,
-            pose=self.pose[:, :6, :6],
-            pose_camera=self.pose_camera[:, :6],
-            pose_right=self.pose_right[:, :6],
-            pose_point=self.pose_point[:, :6],
-            log_precision=0.0,
-        )
+        arrow = Arrowhead(self.cameras.shared, self.cameras.own[:, :6, :6], self.cameras.cross[:, :6])
+        return replace(self, cameras=arrow, pose_point=self.pose_point[:, :6], log_precision=0.0)
 
     def turned(self, axes: Array) -> Information:
         """Express each point's offset in its own axes, the columns of (n, 3, 3)."""
@@ -195,21 +181,18 @@ class Information:
         return replace(
             self,
             point=transposed @ self.point @ axes,
-            point_camera=transposed @ self.point_camera,
-            point_right=(transposed @ self.point_right[..., None])[..., 0],
+            by_camera=transposed @ self.by_camera,
             pose_point=pose_point,
         )
 
     def around_given(self, offsets: Array) -> Information:
         """The same quadratic in the whole offsets (n, 3) instead of their changes."""
         by_point = (self.point @ offsets[..., None])[..., 0]
-        return replace(
-            self,
-            camera_right=self.camera_right + np.einsum("nif,ni->f", self.point_camera, offsets),
-            pose_right=self.pose_right + self.pose_by(offsets),
-            point_right=self.point_right + by_point,
-            cost=self.cost + float((offsets * (2 * self.point_right + by_point)).sum()),
-        )
+        by_shared = np.einsum("nis,ni->s", self.by_camera, offsets)
+        by_camera = self.by_camera.copy()
+        by_camera[..., -1] += by_point
+        cameras = self.cameras.around(self.pose_by(offsets), by_shared, float((offsets * by_point).sum()))
+        return replace(self, cameras=cameras, by_camera=by_camera)
 
 
 @frozen_dataclass(eq=False)
@@ -241,14 +224,14 @@ def folded_information(
     f, P = sum(widths), sum(poses)
     p = 6 if sights[0].shapes is None else 6 + N_SHAPES
     found = Information(  # the sums have one more axis, for the folds
-        np.zeros((n_folds, f, f)), np.zeros((n_folds, f)), np.zeros((P, p, p)), np.zeros((P, p, f)),
-        np.zeros((P, p)), np.zeros((n_folds, n_points, 3, 3)), np.zeros((n_folds, n_points, 3, f)),
-        np.zeros((n_folds, n_points, 3)), np.zeros((P, p, n_points, 3)), 0.0, 0.0,
+        Arrowhead(np.zeros((n_folds, f + 1, f + 1)), np.zeros((P, p, p)), np.zeros((P, p, f + 1))),
+        np.zeros((n_folds, n_points, 3, 3)), np.zeros((n_folds, n_points, 3, f + 1)),
+        np.zeros((P, p, n_points, 3)), 0.0,
     )  # fmt: skip
-    cost, equations, of_poses = np.zeros(n_folds), np.zeros(n_folds), []
+    equations, of_poses = np.zeros(n_folds), []
     ends = zip(np.cumsum(widths).tolist(), np.cumsum(poses).tolist(), strict=True)
     for sight, of_views, width, count, (end, last) in zip(sights, folds, widths, poses, ends, strict=True):
-        cost += _add(found, sight, slice(end - width, end), slice(last - count, last), of_views)
+        _add(found, sight, slice(end - width, end), slice(last - count, last), of_views)
         equations += np.bincount(of_views, sight.views.equations, n_folds)
         of_poses.append(of_views[:count])
     fold = np.concatenate(of_poses)
@@ -256,15 +239,12 @@ def folded_information(
 
     def sums(taken: Callable[[Array], Any], of: NDArray[np.bool_] | slice) -> Information:
         info = replace(
-            found.with_poses_of(found, of),
-            camera=taken(found.camera),
-            camera_right=taken(found.camera_right),
+            found,
+            cameras=replace(found.cameras, shared=taken(found.cameras.shared)),
             point=taken(found.point),
-            point_camera=taken(found.point_camera),
-            point_right=taken(found.point_right),
-            cost=float(taken(cost)),
+            by_camera=taken(found.by_camera),
             equations=float(taken(equations)),
-        )
+        ).with_poses_of(found, of)
         return info.around_straight(np.concatenate(bends)[of]) if bends else info
 
     whole = sums(lambda values: values.sum(axis=0), slice(None))
@@ -277,17 +257,24 @@ def folded_information(
 
 def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
     """(P, p) steps of the poses, and whole bends, given steps of the cameras (f,) and offsets (n, 3)."""
-    right = info.pose_right - info.pose_camera @ camera_step - info.pose_by(offsets)
-    return np.asarray(np.linalg.solve(info.pose, right[..., None])[..., 0])
+    cross = info.cameras.cross
+    right = cross[:, :, -1] - cross[:, :, :-1] @ camera_step - info.pose_by(offsets)
+    return np.asarray(np.linalg.solve(info.cameras.own, right[..., None])[..., 0])
 
 
 def joined(parts: Sequence[Information]) -> Information:
     """Sum over parts of the views of the same cameras."""
-    blocks: dict[str, Any] = {}
-    for field in fields(Information):
-        own = [getattr(part, field.name) for part in parts]
-        blocks[field.name] = np.concatenate(own) if field.name in _OF_POSES else sum(own)
-    return Information(**blocks)
+
+    def total(name: str) -> Any:
+        return sum(getattr(part, name) for part in parts)
+
+    arrows = [part.cameras for part in parts]
+    shared, own, cross = ([getattr(one, name) for one in arrows] for name in ("shared", "own", "cross"))
+    return Information(
+        Arrowhead(np.sum(shared, axis=0), np.concatenate(own), np.concatenate(cross)),
+        total("point"), total("by_camera"), np.concatenate([part.pose_point for part in parts]),
+        total("equations"), total("log_precision"),
+    )  # fmt: skip
 
 
 def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
@@ -295,8 +282,8 @@ def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
     return (joined([part for part in parts if part is not out]) for out in parts)
 
 
-def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> Array:
-    """Add the observations of one camera to the sums of the folds (V,) of its views; return their costs."""
+def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> None:
+    """Add the observations of one camera to the sums of the folds (V,) of its views."""
     views, columns, (n_folds, n_points) = sight.views, sight.columns, found.point.shape[:2]
     # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
     cross = found.pose_point[poses] if sight.free_poses else None
@@ -306,18 +293,15 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArr
     )  # fmt: skip
     normal, px2 = terms.normal, views.pixel_scale**2
     by_fold = px2 * np.stack([normal[fold == k].sum(axis=0) for k in range(n_folds)])
-    found.camera[:, own, own] += by_fold[:, columns[:, None], columns]
-    found.camera_right[:, own] += by_fold[:, columns, -1]
+    kept, place = np.append(columns, normal.shape[1] - 1), np.append(np.arange(own.start, own.stop), -1)
+    found.cameras.shared[:, place[:, None], place] += by_fold[:, kept[:, None], kept]
     found.point[...] += px2 * terms.point
-    found.point_camera[..., own] += px2 * terms.point_camera
-    found.point_right[...] += px2 * terms.point_right
+    found.by_camera[..., place] += px2 * terms.by_camera
     if sight.free_poses:
         of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
-        found.pose[poses] = px2 * normal[:, of_pose[:, None], of_pose]
-        found.pose_camera[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
-        found.pose_right[poses] = px2 * normal[:, of_pose, -1]
+        found.cameras.own[poses] = px2 * normal[:, of_pose[:, None], of_pose]
+        found.cameras.cross[poses][:, :, place] = px2 * normal[:, of_pose[:, None], kept]
         found.pose_point[poses] *= px2
-    return np.asarray(by_fold[:, -1, -1])
 
 
 @frozen_dataclass(eq=False)
@@ -330,8 +314,7 @@ class PointTerms:
 
     normal: Array
     point: Array
-    point_camera: Array
-    point_right: Array
+    by_camera: Array
     pose_point: Array
 
 
@@ -351,9 +334,7 @@ def point_terms(
     """
     fold = np.zeros(batches.n_views, dtype=np.intp)
     terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1, shapes)
-    return replace(
-        terms, point=terms.point[0], point_camera=terms.point_camera[0], point_right=terms.point_right[0]
-    )
+    return replace(terms, point=terms.point[0], by_camera=terms.by_camera[0])
 
 
 def folded_terms(
@@ -405,9 +386,7 @@ def folded_terms(
             np.swapaxes(cross, 1, 2)[places] = each
         else:
             np.add.at(np.swapaxes(cross, 1, 2), places, each)
-    return PointTerms(
-        batches.sum_by_view(by_batch), summed[..., :3], summed[..., 3:-1], summed[..., -1], cross
-    )
+    return PointTerms(batches.sum_by_view(by_batch), summed[..., :3], summed[..., 3:], cross)
 
 
 def _of_each(a: Array, b: Array) -> Array:
@@ -441,15 +420,12 @@ def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
     """Information of some views (V,) of one camera, from `without_points`, with fixed target points."""
-    N = normal[which]
-    columns, of_pose = sight.columns, pose_columns(N.shape[1], sight.shapes is not None)
-    p, f, P = len(of_pose), len(columns), len(N) if sight.free_poses else 0
-    camera, own = N.sum(axis=0), N[:P]
+    of_pose, P = pose_columns(normal.shape[1], sight.shapes is not None), which.sum() * sight.free_poses
+    arrow = Arrowhead.of(normal[which], sight.columns, of_pose)
     found = Information(
-        camera[columns[:, None], columns], camera[columns, -1],
-        own[:, of_pose[:, None], of_pose], own[:, of_pose[:, None], columns], own[:, of_pose, -1],
-        np.zeros((0, 3, 3)), np.zeros((0, 3, f)), np.zeros((0, 3)), np.zeros((P, p, 0, 3)),
-        float(camera[-1, -1]), float(sight.views.equations[which].sum()),
+        replace(arrow, own=arrow.own[:P], cross=arrow.cross[:P]),
+        np.zeros((0, 3, 3)), np.zeros((0, 3, len(arrow.shared))), np.zeros((P, len(of_pose), 0, 3)),
+        float(sight.views.equations[which].sum()),
     )  # fmt: skip
     return found if sight.bends is None else found.around_straight(sight.bends[which])
 

@@ -158,15 +158,12 @@ def camera_step(S: Array, g: Array) -> Array:
 
 def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
     """Eliminate the poses: the cameras' matrix, right side and cost, and the log determinant of the poses."""
-    if not len(info.pose):
-        return info.camera, info.camera_right, info.cost, 0.0
-    root = np.linalg.inv(np.linalg.cholesky(info.pose))
-    rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
+    root = np.linalg.inv(np.linalg.cholesky(info.cameras.own))
+    rows = root @ info.cameras.cross
     flat = rows.reshape(-1, rows.shape[2])
-    S = info.camera - flat[:, :-1].T @ flat[:, :-1]
-    g = info.camera_right - flat[:, :-1].T @ flat[:, -1]
+    M = info.cameras.shared - flat.T @ flat
     logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
-    return S, g, info.cost - float(flat[:, -1] @ flat[:, -1]), logdet
+    return M[:-1, :-1], M[:-1, -1], float(M[-1, -1]), logdet
 
 
 def log_evidence(spare: float, cost: float, logdet: float) -> float:
@@ -296,7 +293,7 @@ class _Climb:
     ) -> None:
         self.system, self.names, self.least_gain = system, prior.names, least_gain
         self.spare, self.log_precision = info.spare, info.log_precision
-        self.gauge = prior.gauge if len(info.pose) else Gauge.none(len(info.point))
+        self.gauge = prior.gauge if len(info.pose_point) else Gauge.none(len(info.point))
         held = [name in absent for name in self.names]
         self.least = np.full(len(self.names), NOTHING * prior.size)
         if "fold" in self.names:

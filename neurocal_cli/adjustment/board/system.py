@@ -33,43 +33,42 @@ class WithoutPoses:
     """
 
     def __init__(self, info: Information, poses: NDArray[np.intp] | None = None) -> None:
-        self.info, (P, p), d = info, info.pose.shape[:2], info.point_right.size
+        self.info, (P, p), d = info, info.pose_point.shape[:2], 3 * len(info.point)
         self.poses = np.arange(P) if poses is None else poses
-        self.root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        f = len(info.camera)
+        self.root, cross = np.linalg.inv(np.linalg.cholesky(info.cameras.own)), info.cameras.cross
+        f = len(info.cameras.shared) - 1
         rows = np.empty((P, p, f + d + 1))
-        np.matmul(self.root, info.pose_camera, out=rows[:, :, :f])
+        np.matmul(self.root, cross[:, :, :-1], out=rows[:, :, :f])
         np.matmul(self.root, info.pose_point.reshape(P, p, d), out=rows[:, :, f:-1])
-        np.matmul(self.root, info.pose_right[..., None], out=rows[:, :, -1:])
+        np.matmul(self.root, cross[:, :, -1:], out=rows[:, :, -1:])
         self.rows = rows.reshape(P * p, f + d + 1)
         self.logdet = -2 * float(np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum())
 
     @cached_property
     def matrix(self) -> Array:
         """(f + 3 n + 1, f + 3 n + 1) reduced matrix, bordered by the right side and the cost."""
-        info, f, n = self.info, len(self.info.camera), len(self.info.point)
+        info, f, n = self.info, len(self.info.cameras.shared) - 1, len(self.info.point)
         M = self.rows.T @ self.rows
         np.negative(M, out=M)
-        M[:f, :f] += info.camera
-        across = info.point_camera.reshape(3 * n, f)
-        M[f:-1, :f] += across
-        M[:f, f:-1] += across.T
+        at = np.append(np.arange(f), len(M) - 1)
+        M[np.ix_(at, at)] += info.cameras.shared
+        across = info.by_camera.reshape(3 * n, f + 1)
+        M[f:-1, at] += across
+        M[at, f:-1] += across.T
         blocks = M[f:-1, f:-1].reshape(n, 3, n, 3)
         np.einsum("ninj->nij", blocks)[...] += info.point
-        right = np.concatenate([info.camera_right, info.point_right.ravel(), [info.cost]])
-        M[-1] += right
-        M[:-1, -1] += right[:-1]
         return np.asarray(M)
 
     def at(self, offsets: Array) -> tuple[Array, Array, Array]:
         """The cameras' matrix (f, f), right sides (f, k) and costs (k,) for given offsets (k, n, 3)."""
-        info, f, k = self.info, len(self.info.camera), len(offsets)
+        info, shared, k = self.info, self.info.cameras.shared, len(offsets)
+        f = len(shared) - 1
         flat = offsets.reshape(k, -1).T
         by_camera, left = self.rows[:, :f], self.rows[:, -1:] - self.rows[:, f:-1] @ flat
-        by_point = (info.point @ offsets[..., None])[..., 0] - 2 * info.point_right
-        right = info.camera_right[:, None] - info.point_camera.reshape(len(flat), f).T @ flat
+        by_point = (info.point @ offsets[..., None])[..., 0] - 2 * info.by_camera[..., -1]
+        right = shared[:-1, -1:] - info.by_camera[..., :-1].reshape(len(flat), f).T @ flat
         return (
-            info.camera - by_camera.T @ by_camera,
+            shared[:-1, :-1] - by_camera.T @ by_camera,
             right - by_camera.T @ left,
             info.cost + (offsets * by_point).sum(axis=(1, 2)) - (left**2).sum(axis=0),
         )
@@ -161,7 +160,7 @@ def system_of(
 
     The parts are those of different views, if they are known already.
     """
-    if points_first(info.pose_right.size, prior):
+    if points_first(info.cameras.cross[..., -1].size, prior):
         return PointsFirst(info, prior)
     return PosesFirst(info, prior, parts)
 
@@ -180,7 +179,7 @@ class PosesFirst:
 
     def __init__(self, info: Information, prior: Prior, parts: Sequence[WithoutPoses] = ()) -> None:
         self.parts = parts or [WithoutPoses(info)]
-        self.coordinates, self.f = coordinates_of(prior), len(info.camera)
+        self.coordinates, self.f = coordinates_of(prior), len(info.cameras.shared) - 1
         self.of_poses = sum(part.logdet for part in self.parts)
         M = self._by_coordinates(self._by_coordinates(sum_of([part.matrix for part in self.parts])).T)
         self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
@@ -327,33 +326,33 @@ class PointsFirst:
 
     def __init__(self, info: Information, prior: Prior) -> None:
         self.info, self.prior = info, prior
-        self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
-        self.f, self.m = len(info.camera), prior.basis.shape[2]
+        self.n, (self.P, self.p) = len(info.point), info.pose_point.shape[:2]
+        self.f, self.m = len(info.cameras.shared) - 1, prior.basis.shape[2]
         self.s = self.f + self.m
-        basis = prior.basis
+        basis, shared, cross = prior.basis, info.cameras.shared, info.cameras.cross
         by_basis = info.point @ basis  # (n, 3, m)
         flat = basis.reshape(3 * self.n, self.m)
-        across = info.point_camera.reshape(3 * self.n, self.f).T @ flat
+        across = info.by_camera.reshape(3 * self.n, self.f + 1).T @ flat
         inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
         pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
         # The matrix of cameras, smooth parts and poses before points are eliminated, bordered by the right
         # side and the cost.
         s, dim = self.s, self.s + self.p * self.P
         M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = np.block([[info.camera, across], [across.T, inner]])
-        M[s:dim, : self.f], M[s:dim, self.f : s] = info.pose_camera.reshape(dim - s, self.f), pose_basis
+        M[:s, :s] = np.block([[shared[:-1, :-1], across[:-1]], [across[:-1].T, inner]])
+        M[s:dim, : self.f], M[s:dim, self.f : s] = cross[:, :, :-1].reshape(dim - s, self.f), pose_basis
         M[:s, s:dim] = M[s:dim, :s].T
         at = s + self.p * np.arange(self.P)
         for i, j in product(range(self.p), repeat=2):
-            M[at + i, at + j] = info.pose[:, i, j]
-        M[: self.f, -1], M[self.f : s, -1] = info.camera_right, info.point_right.ravel() @ flat
-        M[s:dim, -1], M[-1, -1] = info.pose_right.reshape(-1), info.cost
+            M[at + i, at + j] = info.cameras.own[:, i, j]
+        M[: self.f, -1], M[self.f : s, -1] = shared[:-1, -1], across[-1]
+        M[s:dim, -1], M[-1, -1] = cross[:, :, -1].reshape(-1), info.cost
         M[-1, :dim] = M[:dim, -1]
         self.bordered = M
         # (n, 3, s + P p + 1): coupling of each point to all other unknowns and to the right side
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
-        by_shared = [info.point_camera, by_basis]
-        self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
+        by_camera, right = info.by_camera[..., :-1], info.by_camera[..., -1:]
+        self.by_point = np.concatenate([by_camera, by_basis, poses, right], axis=2)
         self.rows = np.empty_like(self.by_point)  # large arrays are quicker to fill again than to allocate
 
     def solve(self, ratios: Mapping[str, float]) -> Solved:

@@ -75,20 +75,16 @@ def evidence_by_precision(info: Information) -> Callable[[Array], Array]:
 
     With the poses eliminated, the three bend coefficients of each view are diagonalised once.
     """
-    Q, X, B = info.pose[:, :6, :6], info.pose[:, :6, 6:], info.pose[:, 6:, 6:]
-    root = np.linalg.inv(np.linalg.cholesky(Q))
-    by_camera = np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
-    rows, of_bends = root @ by_camera[:, :6], root @ X
+    own, by_camera = info.cameras.own, info.cameras.cross
+    root = np.linalg.inv(np.linalg.cholesky(own[:, :6, :6]))
+    rows, of_bends = root @ by_camera[:, :6], root @ own[:, :6, 6:]
     back = np.swapaxes(of_bends, 1, 2)
-    values, vectors = np.linalg.eigh(B - back @ of_bends)
+    values, vectors = np.linalg.eigh(own[:, 6:, 6:] - back @ of_bends)
     values = np.maximum(values, 0.0).ravel()
     along = np.swapaxes(vectors, 1, 2) @ (by_camera[:, 6:] - back @ rows)
-    f, flat, along = len(info.camera), rows.reshape(-1, rows.shape[2]), along.reshape(-1, rows.shape[2])
-    M = np.empty((f + 1, f + 1))
-    M[:f, :f], M[f, :f], M[:f, f], M[f, f] = info.camera, info.camera_right, info.camera_right, info.cost
-    M -= flat.T @ flat
+    flat, along = rows.reshape(-1, rows.shape[2]), along.reshape(-1, rows.shape[2])
     logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
-    least = least_by_precision(M, values, along)
+    least = least_by_precision(info.cameras.shared - flat.T @ flat, values, along)
 
     def evidence(precision: Array) -> Array:
         cost, by_bends = least(precision)
@@ -138,11 +134,10 @@ def _lost(others: Information, halves: list[Information], precision: float | Non
         held = tuple(info.held(precision) for info in (others, *halves))
     camera, lost = camera_step_of(held[0]), 0.0
     for known, info in zip(held[1:], halves[::-1], strict=True):
-        right = known.pose_right - known.pose_camera @ camera
-        own = solve_scaled(known.pose, right[..., None])[..., 0]  # (P, p) steps of poses and bends
-        by_own = info.pose_camera @ camera + 0.5 * (info.pose @ own[..., None])[..., 0] - info.pose_right
-        by_camera = 0.5 * info.camera @ camera - info.camera_right
-        lost += float(info.cost + 2 * (camera @ by_camera + (own * by_own).sum()))
+        step = np.append(camera, -1.0)
+        own = solve_scaled(known.cameras.own, -(known.cameras.cross @ step)[..., None])  # of poses and bends
+        by_own = 2 * (info.cameras.cross @ step)[..., None] + info.cameras.own @ own
+        lost += float(step @ info.cameras.shared @ step + (own * by_own).sum())
     return lost
 
 
@@ -169,7 +164,7 @@ def passes_cross_validation(
     parts = [part.info for part in without]
     folds = np.arange(len(parts))
     # A camera with fewer views than folds is missing in some folds.
-    seen = [np.diagonal(part.camera) > 0 for part in parts]
+    seen = [np.diagonal(part.cameras.shared)[:-1] > 0 for part in parts]
     by_parts = all(some.all() for some in seen)
     try:
         if by_parts:
@@ -179,7 +174,7 @@ def passes_cross_validation(
             estimated = [minimum_of(some, prior, sizes, variance)[1] for some in others]
     except np.linalg.LinAlgError:
         return True
-    tried = np.stack([np.zeros_like(parts[0].point_right), *estimated])
+    tried = np.stack([np.zeros((len(parts[0].point), 3)), *estimated])
     # Costs minimised over cameras and poses: without offsets, and with those from all but each fold.
     if by_parts:
         terms = [np.stack(term) for term in zip(*(some.at(tried) for some in without), strict=True)]
@@ -199,7 +194,7 @@ def passes_cross_validation(
 
 def _seen(info: Information) -> Information:
     """Information without the cameras that have no views."""
-    return info.of_cameras(np.diagonal(info.camera) > 0)
+    return info.of_cameras(np.diagonal(info.cameras.shared)[:-1] > 0)
 
 
 def _least(S: Array, g: Array, cost: Array) -> Array:
@@ -216,11 +211,11 @@ def without_each(
     `variance` [px^2] is that of the noise. Raises `numpy.linalg.LinAlgError` if the other parts do not
     determine the cameras.
     """
-    if points_first(sum(part.info.pose_right.size for part in parts), prior):
+    if points_first(sum(part.info.cameras.cross[..., -1].size for part in parts), prior):
         others = joined_without_each([part.info for part in parts])
         return [minimum_of(some, prior, sizes, variance) for some in others]
     matrices = [part.matrix for part in parts]
-    f = len(parts[0].info.camera)
+    f = len(parts[0].info.cameras.shared) - 1
     whole = sum_of(matrices)
     whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
     estimated = []

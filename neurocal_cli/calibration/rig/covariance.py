@@ -113,8 +113,7 @@ def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     """(F, F) covariance of the free shared parameters of the rig; None if they are not determined."""
     prior = prior_of_target(target)
     info = information_of_rig(target, fit).turned(prior.axes)
-    spare = info.equations - len(info.camera) - 6 * len(info.pose)
-    variance = info.cost / max(spare, 1.0)
+    variance = info.cost / max(info.spare, 1.0)
     info = info.around_given(prior.along_axes(target.offsets))
     try:
         if prior.stated is not None:
@@ -129,9 +128,7 @@ def information_of_rig(target: Target, fit: RigFit) -> Information:
     """The quadratic in the found target's points, the free shared unknowns and the poses."""
     problem, state, n = fit.problem, fit.state, len(target.given)
     columns, shared = state.columns, np.flatnonzero(fit.free)
-    normal = fit.normal.only(shared)
-    point, point_right = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    point_shared = np.zeros((n, 3, columns.n_shared))
+    point, by_shared = np.zeros((n, 3, 3)), np.zeros((n, 3, columns.n_shared + 1))
     pose_point = np.zeros((len(problem.scale), 6, n, 3))
     for side, (observed, own) in enumerate(zip(problem.observations, columns.cameras, strict=True)):
         label, scale = _labels(target, problem, observed), problem.scale[observed.view]
@@ -139,23 +136,12 @@ def information_of_rig(target: Target, fit: RigFit) -> Information:
         terms = point_terms(observed.batches, camera, scale, label, shared_columns, n)
         w, (of_rig, by_rig, by_pose) = observed.weight, problem.pose_steps(state, side)
         point += w * terms.point
-        point_right += w * terms.point_right
-        point_shared[:, :, own] += w * terms.point_camera
-        point_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", terms.pose_point, by_rig)
+        by_shared[:, :, np.append(own, -1)] += w * terms.by_camera
+        by_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", terms.pose_point, by_rig)
         pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, by_pose)
-    return Information(
-        camera=normal.shared[:-1, :-1],
-        camera_right=normal.shared[:-1, -1],
-        pose=normal.own,
-        pose_camera=normal.cross[:, :, :-1],
-        pose_right=normal.cross[:, :, -1],
-        point=point,
-        point_camera=point_shared[:, :, shared],
-        point_right=point_right,
-        pose_point=pose_point,
-        cost=normal.cost,
-        equations=sum(observed.n_equations for observed in problem.observations),
-    )
+    equations = sum(observed.n_equations for observed in problem.observations)
+    by_shared = by_shared[:, :, np.append(shared, -1)]
+    return Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
 
 
 def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDArray[np.intp]:

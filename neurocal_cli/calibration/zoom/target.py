@@ -91,7 +91,7 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
         gain = np.linalg.solve(N[POSE, POSE], by_pose)
         information += _block_diagonal(terms.point) - by_pose.T @ gain
         entries = (
-            terms.point_camera.reshape(3 * n, -1).T
+            terms.by_camera[..., :-1].reshape(3 * n, -1).T
             - N[columns[:, None], np.arange(POSE.start, POSE.stop)] @ gain
         )
         coupling[data.setting[v]] += jacobian[v].T @ entries
