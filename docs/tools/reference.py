@@ -14,7 +14,9 @@ import click
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
+from neurocal_cli.files.board_kinds import COUNTED, KINDS, short_form
 from neurocal_cli.files.exchange.reading import FORMATS, READ
+from neurocal_cli.files.other_boards import FORMATS as BOARDS
 
 DOCS = Path(__file__).resolve().parents[1]
 _MANY_SHARED = 5  # options; fewer are described again
@@ -186,6 +188,7 @@ def _formats_page() -> str:
         "format does not have is refused, with the error of the nearest one in pixels; `--force` writes "
         "that one.",
         "\n".join(models),
+        *_board_parts(),
         "## What is refused",
         "Four coefficients that may be those of an ordinary lens or of a fisheye, unless the file or "
         "`--distortion` says which; numbers that may be the distortion and are under no known name; two "
@@ -198,6 +201,30 @@ def _formats_page() -> str:
         "nearest fisheye, and a warning says by how many pixels it differs.",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _board_parts() -> list[str]:
+    """The kinds of boards with their keys, and the board files of other programs."""
+    rows = ["| kind | keys of a [board file](files.md#board) | `--board` in short |", "| --- | --- | --- |"]
+    for kind, table in KINDS.items():
+        keys = ", ".join(f"[`{name}`]" if optional else f"`{name}`" for name, _, optional, _ in table.keys)
+        counted = f", or `{'`, `'.join(COUNTED.names)}`" if kind == "chessboard" else ""
+        rows.append(f"| `{kind}` | {keys}{counted} | `{short_form(kind)}` |")
+    others = ["| program | files | kinds | told by | unit, if no key says | counted |", "| --- " * 6 + "|"]
+    for one in BOARDS:
+        kinds = ", ".join(f"`{kind}`" for kind, _ in one.kinds.values())
+        told = ", ".join(f"`{name.partition(':')[0]}`" for name in one.told.split())
+        counted = "inner vertices" if one.inner else "squares"
+        others.append(f"| {one.program} | {one.files} | {kinds} | {told} | {one.unit} | {counted} |")
+    return [
+        "## Boards",
+        "A board file of neurocal has these keys; those in brackets may be left out. A board in short counts "
+        "what is in its last brackets.",
+        "\n".join(rows),
+        "Board files of other programs, in YAML, JSON, XML or TOML, are told by any of these keys. They are "
+        "read only. Capitals and underscores do not matter.",
+        "\n".join(others),
+    ]
 
 
 def _api_page() -> str:

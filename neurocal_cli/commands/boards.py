@@ -128,9 +128,9 @@ class BoardOptions:
     @property
     def is_file(self) -> bool:
         """Whether the board is described by a file, not in short."""
-        from neurocal_cli.files.board_kinds import SHORT_FORMS
+        from neurocal_cli.files.board_kinds import KINDS
 
-        return self.file is not None and self.file.partition(":")[0] not in SHORT_FORMS
+        return self.file is not None and self.file.partition(":")[0] not in KINDS
 
     def check_unit(self) -> None:
         """Refuse a unit that cannot be stored in a file, with a UsageError."""

@@ -1,6 +1,6 @@
-"""The kinds of boards in files and on the command line, each with its own keys, and Kalibr's target files.
+"""The kinds of boards: their keys in files, and their short forms on the command line.
 
-On the command line a board is ``kind:COLSxROWS:LENGTH...``, with the lengths of `SHORT_FORMS`.
+A board in short is ``kind:COLSxROWS:LENGTH...``, with lengths that are called as the keys.
 """
 
 from __future__ import annotations
@@ -8,30 +8,70 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import FormatError, InputError, UsageError
+from neurocal_cli.files.key_tables import Keys, inline
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import number, text
+from neurocal_cli.files.yaml_text import boolean, text
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 from neurocal_cli.observations.markers import Markers
 
-# Keys of each kind beside the name and the axes, those that are required first; `chessboard` has its own.
-KIND_KEYS = {
-    "chessboard": ("squares", "square", "cols", "rows"),
-    "charuco": ("squares", "square", "marker", "dictionary", "legacy", "first_id", "inverted"),
-    "aprilgrid": ("tags", "tag", "spacing", "family", "first_id", "border", "inverted"),
-    "arucogrid": ("markers", "marker", "spacing", "dictionary", "first_id", "border", "inverted"),
-    "circles": ("circles", "distance", "diameter"),
-    "asymmetric_circles": ("circles", "distance", "diameter"),
+
+def _counts(field: Field) -> tuple[int, int]:
+    counts = [one.integer(1) for one in field.items()]
+    if len(counts) != 2:
+        field.fail("two whole numbers, [columns, rows]")
+    return counts[0], counts[1]
+
+
+def _legacy(field: Field) -> bool | None:
+    if not (isinstance(field.value, bool) or field.value == "auto"):
+        field.fail("auto, true or false")
+    return None if field.value == "auto" else field.value
+
+
+_VALUES = {
+    "counts": inline(_counts, lambda size: f"[{size[0]}, {size[1]}]"),
+    "side": inline(lambda field: field.integer(2), str),
+    "id": inline(Field.integer, str, 0),
+    "legacy": inline(_legacy, lambda legacy: "auto" if legacy is None else boolean(legacy)),
+    "family": inline(Field.text, text, "tag36h11"),
+    "thick": inline(lambda field: field.integer(1), str, 2),
+    "thin": inline(lambda field: field.integer(1), str, 1),
 }
-SHORT_FORMS = {
-    "chessboard": "chessboard:COLSxROWS:SQUARE (inner vertices)",
-    "charuco": "charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY] (squares)",
-    "aprilgrid": "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY] (tags)",
-    "arucogrid": "arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY (markers)",
-    "circles": "circles:COLSxROWS:DISTANCE[:DIAMETER]",
-    "asymmetric_circles": "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]",
+# Keys of each kind by the arguments of `plane_of`, which is called with the size as one counts it.
+_OF_CIRCLES = "circles=size: counts, distance=square: number, diameter?: number"
+KINDS = {
+    kind: Keys(table, _VALUES)
+    for kind, table in {
+        "chessboard": "cols: side, rows: side, square: number",
+        "charuco": "squares=size: counts, square: number, marker: number, dictionary?: text,"
+        "legacy!: legacy, first_id!: id, inverted?: boolean",
+        "aprilgrid": "tags=size: counts, tag=square: number, spacing: number, family=dictionary!: family,"
+        "first_id!: id, border!: thick, inverted?: boolean",
+        "arucogrid": "markers=size: counts, marker=square: number, spacing: number, dictionary: text,"
+        "first_id!: id, border?: thin, inverted?: boolean",
+        "circles": _OF_CIRCLES,
+        "asymmetric_circles": _OF_CIRCLES,
+    }.items()
 }
+COUNTED = Keys("squares=size: counts, square: number", _VALUES)  # of a chessboard whose squares are counted
+# Keys that follow the size in short forms.
+_SHORT = {
+    "chessboard": "square",
+    "charuco": "square marker dictionary?",
+    "aprilgrid": "tag spacing family?",
+    "arucogrid": "marker spacing dictionary",
+    "circles": "distance diameter?",
+    "asymmetric_circles": "distance diameter?",
+}
+
+
+def short_form(kind: str) -> str:
+    """A kind in short, such as ``charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY] (squares)``."""
+    parts = [f"[:{word[:-1]}]" if word.endswith("?") else f":{word}" for word in _SHORT[kind].split()]
+    counted = "inner vertices" if kind == "chessboard" else KINDS[kind].names[0]
+    return f"{kind}:COLSxROWS{''.join(parts).upper()} ({counted})"
 
 
 def kind_of(plane: Plane) -> str:
@@ -43,100 +83,66 @@ def kind_of(plane: Plane) -> str:
     return "chessboard" if plane.markers is None else "charuco"
 
 
-def read_plane(field: Field, kind: str, name: str, place: dict[str, Any]) -> Plane:
-    """Read the plane of a kind from its keys; an InputError names the key that is out of range."""
+def plane_of(
+    kind: str,
+    size: tuple[int, int],
+    square: float,
+    *,
+    marker: float = 0.0,
+    dictionary: str = "",
+    legacy: bool | None = None,
+    first_id: int = 0,
+    inverted: bool = False,
+    spacing: float = 0.0,
+    border: int = 2,
+    diameter: float = 0.0,
+    **place: Any,
+) -> Plane:
+    """A plane by the numbers of columns and rows of its squares, tags or circles, and the values of its keys.
 
-    def pair(key: str) -> tuple[int, int]:
-        counts = [one.integer(1) for one in field[key].items()]
-        if len(counts) != 2:
-            field[key].fail("two whole numbers, [columns, rows]")
-        return counts[0], counts[1]
-
-    if kind in ("aprilgrid", "arucogrid"):
-        downwards = kind == "arucogrid"
-        cols, rows = pair("markers" if downwards else "tags")
-        tag = field["marker" if downwards else "tag"].number()
-        family = (field["dictionary"] if downwards else field.get("family", "tag36h11")).text()
-        first, inverted = field.get("first_id", 0).integer(0), field.get("inverted", False).boolean()
-        markers = Markers(tag, family, None, first, inverted)
-        spacing, border = field["spacing"].number(), field.get("border", 1 if downwards else 2).integer(1)
+    `place` are its name, origin and axes. An InputError begins with the name of the key that is out of range.
+    """
+    tags = kind in ("aprilgrid", "arucogrid")
+    if tags:
+        size, marker = (2 * size[0], 2 * size[1]), square
+        dictionary = dictionary or ("tag36h11" if kind == "aprilgrid" else "")
+    markers = Markers(marker, dictionary, legacy, first_id, inverted) if tags or kind == "charuco" else None
+    if tags:
         return TagPlane(
-            name, 2 * cols, 2 * rows, tag, markers=markers, spacing=spacing, border=border,
-            downwards=downwards, **place,
+            cols=size[0], rows=size[1], square=square, markers=markers, spacing=spacing, border=border,
+            downwards=kind == "arucogrid", **place,
         )  # fmt: skip
     if kind in ("circles", "asymmetric_circles"):
-        cols, rows = pair("circles")
-        distance, diameter = field["distance"].number(), field.get("diameter", 0.0).number()
+        asymmetric = kind != "circles"
         return CirclePlane(
-            name, cols, rows, distance, diameter=diameter, asymmetric=kind != "circles", **place
+            cols=size[0], rows=size[1], square=square, diameter=diameter, asymmetric=asymmetric, **place
         )
-    if kind == "chessboard" and "squares" not in field:
-        cols, rows = field["cols"].integer(2), field["rows"].integer(2)
-        return Plane(name, cols, rows, field["square"].number(), **place)
-    cols, rows = pair("squares")
-    found = None
-    if kind == "charuco":
-        legacy = field.get("legacy", "auto")
-        if legacy.value not in ("auto", True, False):
-            legacy.fail("auto, true or false")
-        found = Markers(
-            field["marker"].number(),
-            field.get("dictionary", "").text() if "dictionary" in field else "",
-            None if legacy.value == "auto" else legacy.value,
-            field.get("first_id", 0).integer(0),
-            field.get("inverted", False).boolean(),
-        )
-    return Plane(name, cols - 1, rows - 1, field["square"].number(), markers=found, **place)
+    return Plane(cols=size[0] - 1, rows=size[1] - 1, square=square, markers=markers, **place)
 
 
-def kind_entries(plane: Plane) -> dict[str, str]:
-    """Keys of a plane's kind, for a file; nothing for a chessboard, whose keys are the file's own."""
-    markers = plane.markers
-    inverted = {"inverted": "true"} if markers is not None and markers.inverted else {}
-    if isinstance(plane, TagPlane) and markers is not None and plane.downwards:
-        return {
-            "kind": "arucogrid",
-            "markers": f"[{plane.tags[0]}, {plane.tags[1]}]",
-            "marker": number(plane.square),
-            "spacing": number(plane.spacing),
-            "dictionary": text(markers.dictionary),
-            "first_id": str(markers.first_id),
-            **({} if plane.border == 1 else {"border": str(plane.border)}),
-            **inverted,
-        }
-    if isinstance(plane, TagPlane) and markers is not None:
-        family = markers.dictionary.removeprefix("DICT_APRILTAG_")
-        known = f"tag{family}" if family != markers.dictionary else markers.dictionary
-        return {
-            "kind": "aprilgrid",
-            "tags": f"[{plane.tags[0]}, {plane.tags[1]}]",
-            "tag": number(plane.square),
-            "spacing": number(plane.spacing),
-            "family": text(known or "tag36h11"),
-            "first_id": str(markers.first_id),
-            "border": str(plane.border),
-            **inverted,
-        }
-    if isinstance(plane, CirclePlane):
-        entries = {
-            "kind": kind_of(plane),
-            "circles": f"[{plane.cols}, {plane.rows}]",
-            "distance": number(plane.square),
-        }
-        return entries | ({"diameter": number(plane.diameter)} if plane.diameter else {})
-    if markers is None:
-        return {}
-    legacy = "auto" if markers.legacy is None else str(markers.legacy).lower()
-    return {
-        "kind": "charuco",
-        "squares": f"[{plane.cols + 1}, {plane.rows + 1}]",
-        "square": number(plane.square),
-        "marker": number(markers.side),
-        **({"dictionary": text(markers.dictionary)} if markers.dictionary else {}),
-        "legacy": legacy,
-        "first_id": str(markers.first_id),
-        **inverted,
-    }
+def values_of(plane: Plane) -> dict[str, Any]:
+    """The values of a plane by the attributes of `KINDS`."""
+    names = ("cols", "rows", "square", "diameter", "spacing", "border")
+    values: dict[str, Any] = {name: getattr(plane, name, None) for name in names}
+    shift = 0 if isinstance(plane, CirclePlane) else 1
+    values["size"] = plane.cols + shift, plane.rows + shift
+    if (own := plane.markers) is not None:
+        code = own.dictionary
+        if isinstance(plane, TagPlane):
+            values["size"] = plane.tags
+            code = code if plane.downwards else code.replace("DICT_APRILTAG_", "tag")
+        values |= {name: getattr(own, name) for name in ("legacy", "first_id", "inverted")}
+        values |= {"marker": own.side, "dictionary": code}
+    return values
+
+
+def read_plane(field: Field, kind: str, **place: Any) -> Plane:
+    """Read the plane of a kind from its keys; see `plane_of`."""
+    table = COUNTED if kind == "chessboard" and "squares" in field else KINDS[kind]
+    values = table.read(field)
+    if "cols" in values:
+        values["size"] = values.pop("cols") + 1, values.pop("rows") + 1
+    return plane_of(kind, **values, **place)
 
 
 def short_board(form: str, unit: str = "mm") -> Board | None:
@@ -145,67 +151,19 @@ def short_board(form: str, unit: str = "mm") -> Board | None:
     Raises UsageError if it begins like one and is not.
     """
     kind, colon, rest = form.partition(":")
-    if kind not in SHORT_FORMS or not colon:
+    if kind not in KINDS or not colon:
         return None
     size, *parts = rest.split(":")
     counts = re.fullmatch(r"(\d+)x(\d+)", size)
-    wrong = UsageError(f"--board {form[:60]}: give {SHORT_FORMS[kind]}")
-    if counts is None:
-        raise wrong
-    cols, rows = int(counts[1]), int(counts[2])
-    words = {"charuco": 2, "aprilgrid": 2, "arucogrid": 2}.get(kind)
-    code = parts.pop() if words is not None and len(parts) == words + 1 else ""
-    if kind == "arucogrid" and not code:
-        raise wrong
+    words = _SHORT[kind].split()
     try:
-        lengths = [float(part) for part in parts]
-    except ValueError:
-        raise wrong from None
-    if not (words or 1) <= len(lengths) <= (words or {"chessboard": 1}.get(kind, 2)):
-        raise wrong
-    try:
-        if kind == "chessboard":
-            return Board((Plane("", cols, rows, lengths[0]),), unit)
-        if kind == "charuco":
-            return Board(
-                (Plane("", cols - 1, rows - 1, lengths[0], markers=Markers(lengths[1], code)),), unit
-            )
-        if kind == "aprilgrid":
-            return Board((TagPlane.of((cols, rows), lengths[0], lengths[1], code or "tag36h11"),), unit)
-        if kind == "arucogrid":
-            side, spacing = lengths
-            return Board((TagPlane.of((cols, rows), side, spacing, code, border=1, downwards=True),), unit)
-        diameter = lengths[1] if len(lengths) > 1 else 0.0
-        asymmetric = kind != "circles"
-        plane = CirclePlane("", cols, rows, lengths[0], diameter=diameter, asymmetric=asymmetric)
+        if counts is None or len(parts) > len(words):
+            raise FormatError("the size is missing", "--board")
+        both = [int(counts[1]), int(counts[2])]
+        keys = {"cols": both[0], "rows": both[1]} if kind == "chessboard" else {KINDS[kind].names[0]: both}
+        tree = {**keys, **{word.rstrip("?"): part for word, part in zip(words, parts, strict=False)}}
+        return Board((read_plane(Field(tree, "--board"), kind, name=""),), unit)
+    except FormatError as error:
+        raise UsageError(f"--board {form[:60]}: give {short_form(kind)}") from error
     except InputError as error:
         raise UsageError(f"--board {form[:60]}: {error}") from error
-    return Board((plane,), unit)
-
-
-def is_kalibr(root: Field) -> bool:
-    """Whether the tree is a target file of Kalibr."""
-    return "target_type" in root
-
-
-def kalibr_plane(root: Field) -> Plane:
-    """Plane of Kalibr's aprilgrid, checkerboard or circlegrid; lengths are in metres."""
-    kind = root["target_type"].text()
-    if kind == "aprilgrid":
-        tags = root["tagCols"].integer(1), root["tagRows"].integer(1)
-        # Older files name the distance of two tags' sides, newer ones its ratio; both name it tagSpacing.
-        first = root.get("codeOffset", 0).integer(0)
-        return TagPlane.of(tags, root["tagSize"].number(), root["tagSpacing"].number(), first_id=first)
-    cols, rows = (root[key].integer(2) for key in ("targetCols", "targetRows"))
-    if kind == "circlegrid":
-        asymmetric = bool(root.get("asymmetricGrid", False).value)
-        return CirclePlane("", cols, rows, root["spacingMeters"].number(), asymmetric=asymmetric)
-    if kind != "checkerboard":
-        root["target_type"].fail("aprilgrid, checkerboard or circlegrid")
-    down, along = root["rowSpacingMeters"].number(), root["colSpacingMeters"].number()
-    if down != along:
-        root.refuse(
-            f"the squares are {along:g} x {down:g} m; neurocal describes boards of squares",
-            "correct rowSpacingMeters and colSpacingMeters",
-        )
-    return Plane("", cols, rows, along)

@@ -2,9 +2,9 @@
 
 A table of keys is a text, ``"seed: integer, center=centre?: pair"``: the names of keys, those of the
 attributes with their values if they differ, and kinds. A key with ``?`` is left out of the file if its value
-is the empty one of its kind, which it has if it is left out. Sizes such as ``3x4`` are arrays; ``n`` is any
-length. A table of columns, ``"point?: label, found=X Y Z: number"``, has the names of the columns of each
-attribute, and what stands in them.
+is the empty one of its kind, which it has if it is left out; one with ``!`` is always written, but may lack.
+Sizes such as ``3x4`` are arrays; ``n`` is any length. A table of columns, ``"point?: label, found=X Y Z:
+number"``, has the names of the columns of each attribute, and what stands in them.
 
 Long columns are texts of comma-separated numbers, ``X: ['0.0,20.0,40.0']``, or packed. PyYAML's pure-Python
 parser takes 50 us per number, but only 0.3 us per character of a text. A number of 17 digits has 20
@@ -240,7 +240,7 @@ def read_named(field: Field) -> dict[str, Field]:
     return found
 
 
-_ENTRY = re.compile(r"\s*(\w+)(?:=(\w+))?(\?)?(?::\s*([\w ]+?))?\s*").fullmatch
+_ENTRY = re.compile(r"\s*(\w+)(?:=(\w+))?([?!])?(?::\s*([\w ]+?))?\s*").fullmatch
 
 
 @frozen_dataclass(eq=False)
@@ -281,7 +281,7 @@ def _estimate(field: Field) -> tuple[float, float]:
 
 
 _KINDS = {
-    "text": inline(Field.text, lambda value: text(str.__str__(value))),
+    "text": inline(Field.text, lambda value: text(str.__str__(value)), ""),
     "integer": inline(Field.integer, lambda value: str(int(value))),
     "boolean": inline(Field.boolean, boolean, False),
     "number": inline(Field.number, number, 0.0),
@@ -339,6 +339,11 @@ class Keys:
             self.keys.append((name, attribute or name, optional, _kind(word, kinds or {})))
         self.computed = computed
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all keys."""
+        return tuple(name for name, *_ in self.keys)
+
     def lines(self, value: Any, long: bool = False) -> Iterator[str]:
         """Lines of the block."""
         for name, attribute, optional, kind in self.keys:
@@ -347,7 +352,7 @@ class Keys:
             else:
                 own = value[attribute] if isinstance(value, dict) else getattr(value, attribute)
             same = own is kind.empty or (not isinstance(own, np.ndarray) and own == kind.empty)
-            if not (optional and same):
+            if not (optional == "?" and same):
                 yield from kind.lines(name, own, long)
 
     def flow(self, value: Any) -> str:

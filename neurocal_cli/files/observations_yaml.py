@@ -32,7 +32,7 @@ from neurocal_cli.files.key_tables import (
 )
 from neurocal_cli.files.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import flow, indented, number, quoted, text
+from neurocal_cli.files.yaml_text import flow, indented, number, quoted
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.points import Correspondences
 
@@ -54,7 +54,6 @@ def _distance_lines(key: str, distances: Iterable[Distance], long: bool) -> Iter
 _HEAD = Keys(
     "undistorted?: text, board?: quoted, distances?: distances",
     {
-        "text": inline(Field.text, text, ""),
         "quoted": inline(Field.text, quoted, ""),
         "distances": Kind(lambda field: tuple(map(_distance, field.items())), _distance_lines, ()),
     },

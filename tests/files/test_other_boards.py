@@ -112,7 +112,32 @@ def test_the_arguments_of_opencv_describe_a_board(tmp_path: Path, text: str) -> 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     path = tmp_path / "board.yaml"
     path.write_text("squares_x: 8\nsquares_y: 6\nmarker_length: 0.02\n")
-    with pytest.raises(FormatError, match="a board of markers without squarelength; describe the board"):
+    with pytest.raises(FormatError, match="without square_length; describe the board"):
+        read_board(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            OPENCV.format(kind="SPHERES", cols=9),
+            "Calibrate_Pattern must be chessboard, charucoboard, circlesgrid",
+        ),
+        (
+            OPENCV.replace("Calibrate_Pattern", "Pattern").format(kind="CHESSBOARD", cols=9),
+            "without Calibrate_P",
+        ),
+        (
+            "tagCols: 6\ntagRows: 6\ntagSize: 0.08\ntagSpacing: 0.3\n",
+            "Kalibr is the nearest .* has target_type",
+        ),
+        ("kind: charuco\nsquares: [8, 6]\nsquare: 30\nmarker: 20\nlegacy: 1\n", "legacy must be auto, true"),
+    ],
+)
+def test_a_file_that_is_nearly_a_board_is_told_what_it_lacks(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "board.txt"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=message):
         read_board(path)
 
 
