@@ -240,7 +240,7 @@ def _triangulate_many(
     names = list(rig.cameras)
     text = format_many_points(found, seen.names, names, unit=rig.unit, sigma=sigma, limit=limit)
     end_waiting()
-    write_chunks(output, iter([text]))
+    write_chunks(output, text)
     off = int((~found.behind & ~(found.error <= limit)).sum())
     behind, without = int(found.behind.sum()), int((found.contradicts >= 0).sum())
     if as_json:

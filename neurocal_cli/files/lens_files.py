@@ -7,7 +7,6 @@ of names of calibration files.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +30,7 @@ from neurocal_cli.files.key_tables import Columns, Keys, Kind, inline, record
 from neurocal_cli.files.points_csv import POINTS, correspondences, format_points
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.table import Table, parse_table
-from neurocal_cli.files.table_header import Schema
+from neurocal_cli.files.table_header import Schema, column_names
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
 from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, quoted, read_yaml, text
@@ -40,6 +39,7 @@ _FORMAT = 2
 _BLOCK = "neurocal_lens"
 _CAMERA = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_UNITS = 1000
+_HEADER = 10_000  # bytes in which the header is
 
 
 def format_lens(lens: ZoomLens) -> str:
@@ -274,7 +274,7 @@ def read_lens_data(
     if not several:
         raise InputError("there are no files; give at least one")
     contents = [read_bytes(path) for path in several]
-    headers = [_header(data) for data, _ in contents]
+    headers = [column_names(data[:_HEADER].decode("utf-8", "replace"), POINTS) for data, _ in contents]
     known = all("alpha_u" in names or (_FILES in names and "X" not in names) for names in headers)
     schemas = [POINTS if not known else _CAMERAS if "alpha_u" in names else _LIST for names in headers]
     tables = [parse_table(*content, schema) for content, schema in zip(contents, schemas, strict=True)]
@@ -307,14 +307,6 @@ def write_lens_points(lens: LensPoints, path: str | Path) -> None:
     for k, s in enumerate(lens.point_setting.tolist(), start=first + 1):
         lines[k] = f"{settings[s]},{lines[k]}"
     write_whole(path, "\n".join(lines))
-
-
-def _header(data: bytes) -> set[str]:
-    """Names of the columns, and perhaps parts of other words."""
-    for line in data.removeprefix(b"\xef\xbb\xbf").splitlines():
-        if line.strip() and not line.lstrip().startswith(b"#"):
-            return set(re.split(r'[\s,;"]+', line.decode("utf-8", "replace")))
-    return set()
 
 
 def _points(tables: list[Table], notes: list[str]) -> LensPoints:

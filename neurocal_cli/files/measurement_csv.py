@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,35 +16,40 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.measured import PlanePoints
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.reading import read_blocks
-from neurocal_cli.files.table import read_table, stream_table
-from neurocal_cli.files.table_header import Schema, quoted_field
+from neurocal_cli.files.table import Table, read_table, stream_table
+from neurocal_cli.files.table_header import Schema, column_names, quoted_field
 
-MATCHES = Schema(
-    kind="matches",
-    required=("uL", "vL", "uR", "vR"),
-    optional=("point",),
-    labels=frozenset({"point"}),
-    headerless=True,
-)
-SIGHTINGS = Schema(
-    kind="sightings",
-    required=("point", "camera", "u", "v"),
-    labels=frozenset({"point", "camera"}),
-)
-MANY_COLUMNS = (
-    "point",
-    *("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ"),
-    "error",
-    "cameras",
-    "without",
-    "flag",
-)
+_POINT = frozenset({"point"})
+MATCHES = Schema("matches", ("uL", "vL", "uR", "vR"), ("point",), labels=_POINT, headerless=True)
+SIGHTINGS = Schema("sightings", ("point", "camera", "u", "v"), labels=frozenset({"point", "camera"}))
+PIXELS = Schema("pixels", ("u", "v"), ("point",), labels=_POINT, headerless=True)
+_SPACE = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ")
+_FLAGS = np.array(["ok", "off", "behind"])
 _HEADER = 4096  # bytes in which the header is
 _LARGEST = 1e100  # squares of pixels beyond this overflow
-COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
-_FLAGS = np.array(["ok", "off", "behind"])
-# Ten digits of the coordinates, more than their accuracy; six digits of covariance and epipolar error.
-_ROW = ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%s"])
+
+Batch = tuple[Array, NDArray[Any] | None]  # pixels (N, 2) and the names of their points
+
+
+def _pixels(table: Table, names: tuple[str, ...]) -> Array:
+    """The columns of pixels (N, k)."""
+    pixels = table.stack(names)
+    sensible = np.abs(pixels).max(axis=1) <= _LARGEST
+    if not sensible.all():
+        row = int(np.argmin(sensible))
+        raise InputError(
+            f"{table.source}:{table.lines[row]}: {','.join(names)} must be numbers of a sensible size, found "
+            f"{', '.join(f'{x:g}' for x in pixels[row])}; correct or remove the row"
+        )
+    return pixels
+
+
+def read_pixels(path: str | Path, notes: list[str] | None = None, schema: Schema = PIXELS) -> Iterator[Batch]:
+    """Read pixels in batches of some ten thousand; remarks of the first are appended to `notes`."""
+    for k, table in enumerate(stream_table(path, schema)):
+        if k == 0 and notes is not None:
+            table.note_unknown(notes)
+        yield _pixels(table, schema.required), table.labels.get("point")
 
 
 @frozen_dataclass(eq=False)
@@ -61,48 +65,9 @@ class Matches:
 
 
 def read_matches(path: str | Path, notes: list[str] | None = None) -> Iterator[Matches]:
-    """Read matches in batches of some ten thousand; remarks of the first are appended to `notes`."""
-    for k, table in enumerate(stream_table(path, MATCHES)):
-        if k == 0 and notes is not None:
-            table.note_unknown(notes)
-        pixels = table.stack(MATCHES.required)
-        sensible = np.abs(pixels).max(axis=1) <= _LARGEST
-        if not sensible.all():
-            row = int(np.argmin(sensible))
-            raise InputError(
-                f"{table.source}:{table.lines[row]}: uL,vL,uR,vR must be numbers of a sensible size, found "
-                f"{', '.join(f'{x:g}' for x in pixels[row])}; correct or remove the row"
-            )
-        yield Matches(pixels[:, :2], pixels[:, 2:], table.labels.get("point"))
-
-
-def format_space_points(
-    batches: Iterable[tuple[Triangulated, NDArray[Any] | None]], *, unit: str, sigma: float, limit: float
-) -> Iterator[str]:
-    """Text of a file, one part per batch of optimally triangulated points and their labels.
-
-    The first part includes the header. `sigma` [px], the standard deviation of the pixels, scales the
-    covariances. Points whose epipolar error is beyond `limit` [px] are flagged.
-    """
-    header = [
-        "# frame: left camera; X right, Y down, Z forward, the centre of its lens at 0",
-        f"# unit: {unit}",
-        f"# sigma: {sigma:.6g}",
-        f"# epipolar_limit: {limit:.6g}",
-    ]
-    for k, (found, labels) in enumerate(batches):
-        if k == 0:
-            names = COLUMNS if labels is None else ("point", *COLUMNS)
-            yield "\n".join([*header, ",".join(names), ""])
-        assert found.covariance is not None
-        numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
-        numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
-        flags = _FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
-        columns: list[list[Any]] = [*numbers.T.tolist(), flags]
-        row = _ROW
-        if labels is not None:
-            columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
-        yield "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"
+    """Read matches in batches; see `read_pixels`."""
+    for pixels, labels in read_pixels(path, notes, MATCHES):
+        yield Matches(pixels[:, :2], pixels[:, 2:], labels)
 
 
 @frozen_dataclass(eq=False)
@@ -119,12 +84,8 @@ def has_sightings(path: str | Path) -> bool:
     """Whether the header of a file names a camera and one pixel in each row; not for standard input."""
     if str(path) == "-":
         return False
-    for data in read_blocks(path, _HEADER):
-        words = re.split(
-            rb"[,;\s]+", b" ".join(line for line in data.splitlines()[:40] if not line.startswith(b"#"))
-        )
-        return {b"camera", b"u", b"v"} <= set(words)
-    return False
+    head = next(iter(read_blocks(path, _HEADER)), b"").decode("utf-8", "replace")
+    return {"camera", "u", "v"} <= set(column_names(head, SIGHTINGS))
 
 
 def read_sightings(path: str | Path, notes: list[str] | None = None) -> Sightings:
@@ -132,82 +93,86 @@ def read_sightings(path: str | Path, notes: list[str] | None = None) -> Sighting
     table = read_table(path, SIGHTINGS)
     if notes is not None:
         table.note_unknown(notes)
-    pixels = table.stack(("u", "v"))
-    sensible = np.abs(pixels).max(axis=1) <= _LARGEST
-    if not sensible.all():
-        row = int(np.argmin(sensible))
-        raise InputError(
-            f"{table.source}:{table.lines[row]}: u,v must be numbers of a sensible size; correct the row"
-        )
-    number: dict[str, int] = {}
-    point = np.array(
-        [number.setdefault(str(name), len(number)) for name in table.labels["point"]], dtype=np.intp
-    )
-    return Sightings(pixels, point, table.labels["camera"], tuple(number))
+    pixels, number = _pixels(table, ("u", "v")), dict[str, int]()
+    point = [number.setdefault(str(name), len(number)) for name in table.labels["point"]]
+    return Sightings(pixels, np.array(point, dtype=np.intp), table.labels["camera"], tuple(number))
+
+
+def _table(
+    header: Sequence[str],
+    names: Sequence[str],
+    forms: str,
+    batches: Iterable[tuple[Sequence[str] | None, Array, Sequence[Sequence[Any]]]],
+) -> Iterator[str]:
+    """Text of a table, a part per batch: labels of points, numbers in these forms, and other columns."""
+    for k, (labels, numbers, others) in enumerate(batches):
+        first = [] if labels is None else [list(map(quoted_field, labels))]
+        if k == 0:
+            yield "\n".join([*header, ",".join([*(["point"] if first else []), *names]), ""])
+        numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
+        row = ",".join([*(["%s"] * len(first)), *forms.split(), *["%s"] * len(others)])
+        lines = map(row.__mod__, zip(*first, *numbers.T.tolist(), *others, strict=True))
+        yield "".join(f"{line}\n" for line in lines)
+
+
+# Ten digits of the coordinates, more than their accuracy; six digits of covariance and error.
+_IN_SPACE = "%.10g " * 3 + "%.6g " * 7
+_ON_PLANE = "%.10g " * 3 + "%.6g " * 3
+
+
+def format_space_points(
+    batches: Iterable[tuple[Triangulated, NDArray[Any] | None]], *, unit: str, sigma: float, limit: float
+) -> Iterator[str]:
+    """Text of a file, one part per batch of optimally triangulated points and their labels.
+
+    The first part includes the header. `sigma` [px], the standard deviation of the pixels, scales the
+    covariances. Points whose epipolar error is beyond `limit` [px] are flagged.
+    """
+
+    def columns(found: Triangulated, labels: NDArray[Any] | None) -> tuple[Any, Array, list[list[str]]]:
+        assert found.covariance is not None
+        numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
+        flags = _FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
+        return None if labels is None else labels.tolist(), numbers, [flags]
+
+    header = [
+        "# frame: left camera; X right, Y down, Z forward, the centre of its lens at 0",
+        f"# unit: {unit}",
+        f"# sigma: {sigma:.6g}",
+        f"# epipolar_limit: {limit:.6g}",
+    ]
+    names = (*_SPACE, "epipolar", "flag")
+    return _table(header, names, _IN_SPACE, (columns(*batch) for batch in batches))
 
 
 def format_many_points(
     found: SpacePoints, names: Sequence[str], cameras: Sequence[str], *, unit: str, sigma: float, limit: float
-) -> str:
+) -> Iterator[str]:
     """Text of a file of points that any number of cameras saw; see `format_space_points`."""
-    lines = [
+    header = [
         f"# frame: camera {cameras[0]}; X right, Y down, Z forward, the centre of its lens at 0",
         f"# unit: {unit}",
         f"# sigma: {sigma:.6g}",
         f"# error_limit: {limit:.6g}",
-        ",".join(MANY_COLUMNS),
     ]
     numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.error])
-    numbers[~np.isfinite(numbers)] = np.nan
     flags = _FLAGS[np.where(found.behind, 2, (~(found.error <= limit)).astype(int))].tolist()
     without = [quoted_field(cameras[k]) if k >= 0 else "" for k in found.contradicts]
-    row = "%s," + ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%d", "%s", "%s"])
-    columns = [list(map(quoted_field, names)), *numbers.T.tolist(), found.n_cameras.tolist(), without, flags]
-    lines += map(row.__mod__, zip(*columns, strict=True))
-    return "\n".join([*lines, ""])
-
-
-PIXELS = Schema(
-    kind="pixels",
-    required=("u", "v"),
-    optional=("point",),
-    labels=frozenset({"point"}),
-    headerless=True,
-)
-PLANE_COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sYY", "flag")
-_PLANE_FLAGS = np.array(["behind", "ok"])
-_PLANE_ROW = ",".join(["%.10g"] * 3 + ["%.6g"] * 3 + ["%s"])
-
-Batch = tuple[Array, NDArray[Any] | None]  # pixels (N, 2) and the names of their points
-
-
-def read_pixels(path: str | Path, notes: list[str]) -> Iterator[Batch]:
-    """Read pixels in batches; remarks on columns that are not used are appended to `notes`."""
-    for k, table in enumerate(stream_table(path, PIXELS)):
-        if k == 0:
-            table.note_unknown(notes)
-        pixels = table.stack(PIXELS.required)
-        sensible = np.abs(pixels).max(axis=1) <= _LARGEST
-        if not sensible.all():
-            line = table.lines[int(np.argmin(sensible))]
-            raise InputError(
-                f"{table.source}:{line}: u,v must be numbers of a sensible size; correct the row"
-            )
-        yield pixels, table.labels.get("point")
+    others = [found.n_cameras.tolist(), without, flags]
+    columns = (*_SPACE, "error", "cameras", "without", "flag")
+    return _table(header, columns, _IN_SPACE, [(names, numbers, others)])
 
 
 def format_plane_points(
     batches: Iterable[tuple[PlanePoints, NDArray[Any] | None]], *, view: str, unit: str, sigma: float
 ) -> Iterator[str]:
     """Text of a file, one part per batch of points and their names; the first includes the header."""
-    header = [f"# plane: Z = 0 of the target of the view {view}", f"# unit: {unit}", f"# sigma: {sigma:.6g}"]
-    for k, (found, labels) in enumerate(batches):
-        if k == 0:
-            names = PLANE_COLUMNS if labels is None else ("point", *PLANE_COLUMNS)
-            yield "\n".join([*header, ",".join(names), ""])
+
+    def columns(found: PlanePoints, labels: NDArray[Any] | None) -> tuple[Any, Array, list[list[str]]]:
         numbers = np.column_stack([found.points, found.covariance.reshape(-1, 4)[:, [0, 1, 3]]])
-        columns: list[list[Any]] = [*numbers.T.tolist(), _PLANE_FLAGS[found.seen.astype(int)].tolist()]
-        row = _PLANE_ROW
-        if labels is not None:
-            columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_PLANE_ROW}"
-        yield "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"
+        flags = _FLAGS[np.where(found.seen, 0, 2)].tolist()
+        return None if labels is None else labels.tolist(), numbers, [flags]
+
+    header = [f"# plane: Z = 0 of the target of the view {view}", f"# unit: {unit}", f"# sigma: {sigma:.6g}"]
+    names = ("X", "Y", "Z", "sXX", "sXY", "sYY", "flag")
+    return _table(header, names, _ON_PLANE, (columns(*batch) for batch in batches))

@@ -178,6 +178,24 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
     )
 
 
+def column_names(text: str, schema: Schema) -> tuple[str, ...]:
+    """Names of the columns of what may be a table, as the schema has them; none if it has no header.
+
+    A file of as many numbers as there are required columns needs no header.
+    """
+    for line in text.split("\n"):
+        line = line.strip("\ufeff \t\r")
+        if line and not line.startswith("#") and not _EXCEL(line):
+            try:
+                fields = split_fields(line, _find_separator(line))
+            except InputError:
+                return ()
+            if all(map(is_number, fields)):
+                return schema.required if schema.headerless and len(fields) == len(schema.required) else ()
+            return () if re.search("[:{<=]", line) else tuple(_renamed(fields, schema)[0])
+    return ()
+
+
 def plain(name: str) -> str:
     """A name in lower-case letters and digits."""
     return re.sub(r"[^a-z0-9]", "", name.lower())

@@ -15,12 +15,12 @@ from neurocal_cli.errors import FormatError, value_failures
 from neurocal_cli.files.points_csv import PIXEL, PLACE, POINTS, correspondences, read_points
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.table import Table, read_table
-from neurocal_cli.files.table_header import find_layout
+from neurocal_cli.files.table_header import column_names
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.points import Correspondences
 
-# Columns of a table whose points are told by their places on the board, and how its header looks.
+# Columns of a table whose points are told by their places on the board.
 _CELLS = replace(
     POINTS,
     required=PIXEL,
@@ -33,11 +33,6 @@ _CELLS = replace(
         "point": (*POINTS.aliases["point"], "id"),
     },
     others=((tuple("xy"), PIXEL),),
-)
-BY_CELL = re.compile(
-    r"\A\ufeff?(?:#[^\n]*\n|\s*\n)*(?:(?=[^\n]*row)(?=[^\n]*col)|(?=[^\n]*(?:point|corner|id\b)))"
-    r"[^\n:#{<=]*,[^\n:#{<=]*\r?\n",
-    re.IGNORECASE,
 )
 
 
@@ -65,12 +60,17 @@ def table_of(names: list[str], given: Given) -> Correspondences:
     return replace(points, unit=str(given.unit))
 
 
-def has_places(data: bytes, source: str) -> bool:
-    """Whether a table has X, Y, Z under any of their names."""
-    try:
-        return set(PLACE) <= set(find_layout(data, source, POINTS).names)
-    except FormatError:
-        return False
+def is_of_cells(text: str) -> bool:
+    """Whether a text may be a table of pixels and their places on a board, without X, Y, Z under any name."""
+    names, given = set(column_names(text, _CELLS)), set(PLACE) & set(column_names(text, POINTS))
+    told = "point" in names or {"row", "col"} <= names or (not given and {"u", "v"} <= names)
+    return told and len(given) < len(PLACE)
+
+
+def has_points(text: str) -> bool:
+    """Whether a text may be a table of points, perhaps with some of the columns under other names."""
+    names = {name.lower() for name in column_names(text, POINTS)}
+    return {"u", "v"} <= names or {"x", "y"} <= names
 
 
 def of_cells(names: list[str], board: Board, notes: list[str]) -> Correspondences:

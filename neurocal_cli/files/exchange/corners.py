@@ -25,10 +25,10 @@ from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_names import NAMES, plain
 from neurocal_cli.files.exchange.corner_tables import (
-    BY_CELL,
     Given,
     assembled,
-    has_places,
+    has_points,
+    is_of_cells,
     of_board,
     of_cells,
     separate,
@@ -55,14 +55,6 @@ TABLES = (".csv", ".txt", ".tsv")  # endings of tables of points
 BOARD_ADVICE = "give --board chessboard:COLSxROWS:SQUARE"
 _HEAD = 1_000_000  # characters that show of what kind a file is
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
-# A header with names of X and v, or of u and v, in any order; or a first row of five numbers.
-_TABLE = re.compile(
-    r"\A\ufeff?(?:#[^\n]*\n|\s*\n)*(?:"
-    r"(?:(?=[^\n]*(?:\bX\b|x_?world|world_?x|obj))(?=[^\n]*(?:\bv\b|img|pix|v_?px|image))"
-    r"|(?=[^\n]*\bu\b)(?=[^\n]*\bv\b))[^\n:#{<=]*\r?\n"
-    r"|(?:[-+0-9.eE]+[ \t]*[,;\t ][ \t]*){4}[-+0-9.eE]+[ \t]*\r?(?:\n|\Z))",
-    re.IGNORECASE,
-)
 _KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
 _NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
 
@@ -109,9 +101,9 @@ def read_corners(
         return None
     if _NUMBERS.match(text):
         return separate(names, given)
-    if board is not None and BY_CELL.match(text) and not has_places(data, source):
+    if board is not None and is_of_cells(text):
         return of_cells(names, board, notes)
-    if _TABLE.match(text):
+    if has_points(text):
         return table_of(names, given)
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
     if named or text.lstrip().startswith(("{", "<", "%YAML", "/", "[{", "[\n")):
@@ -146,7 +138,7 @@ def _corners(
     places = root.first(_WORLD)
     world = None if places is None else _stack(places, 3)
     stated = root["unit"].text() if "unit" in root else given.unit
-    ids = root.read("points", Field.texts)
+    ids = root.read("points", lambda field: field.names(pixels.shape[1]))
     if world is None:
         world, ids = of_board(board, pixels.shape[1], field, given.advice, down)
         stated = board.unit if board else stated
