@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,24 +178,29 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     _check_settings(tables, notes)
     _check_one_camera(tables)
     several = len(tables) > 1
-    images = _images(tables)
+    images = _of_some(
+        tables,
+        [_views_of_file(table) if "board" in table.labels else None for table in tables],
+        _without("column board"),
+    )
     tables = [_told_apart(table) for table in tables] if images is not None else tables
     views = [_views_of_file(table) for table in tables] if several or "view" in tables[0].labels else None
     owners = _owners(tables, views) if several and views else None
-    points, without = None, [table.source for table in tables if "point" not in table.labels]
-    if not without:
-        points = _joined([table.labels["point"] for table in tables])
-    elif len(without) < len(tables):
-        notes.append(f"{without[0]}: has no column point, so the point ids of the other files are not used")
+    points = _if_all(tables, "point", "point ids", notes)
+
+    def known_or_zero(names: tuple[str, ...]) -> Array | None:
+        blocks = [_together(table, names) for table in tables]
+        return _of_some(tables, blocks, lambda table: np.zeros((len(table), len(names))))
+
     return Correspondences(
         _joined([table.stack(PLACE) for table in tables]),
         _joined([table.stack(PIXEL) for table in tables]),
         view=None if views is None else _joined(views),
         point=points,
-        covariance=_covariance(tables),
-        world_std=_where_known(tables, OPTIONAL["world_std"]),
-        across=_where_known(tables, OPTIONAL["across"]),
-        time=_times(tables, notes),
+        covariance=_of_some(tables, list(map(_covariance, tables)), _without("sigma (or suu,suv,svv)")),
+        world_std=known_or_zero(OPTIONAL["world_std"]),
+        across=known_or_zero(OPTIONAL["across"]),
+        time=_if_all(tables, "time", "times", notes),
         image=images,
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
@@ -209,22 +214,31 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     )
 
 
-def _times(tables: list[Table], notes: list[str]) -> Array | None:
-    """Times of all rows, if all files have them."""
-    without = [table.source for table in tables if "time" not in table.numbers]
-    if without and len(without) < len(tables):
-        notes.append(f"{without[0]}: has no column time, so the times of the other files are not used")
-    return None if without else _joined([table.numbers["time"] for table in tables])
+def _if_all(tables: list[Table], name: str, said: str, notes: list[str]) -> NDArray[Any] | None:
+    """A column that all files have; a note if some have it."""
+    columns = [table.labels.get(name, table.numbers.get(name)) for table in tables]
+    there = [column for column in columns if column is not None]
+    if there and len(there) < len(tables):
+        lacking = next(table for table, column in zip(tables, columns, strict=True) if column is None)
+        notes.append(f"{lacking.source}: has no column {name}, so the {said} of the other files are not used")
+    return _joined(there) if len(there) == len(tables) else None
 
 
-def _images(tables: list[Table]) -> NDArray[Any] | None:
-    """The image of each row, if the rows name the boards in it, as those of all files or none must."""
-    without = [table.source for table in tables if "board" not in table.labels]
-    if len(without) == len(tables):
+def _of_some(
+    tables: list[Table], blocks: Sequence[NDArray[Any] | None], otherwise: Callable[[Table], NDArray[Any]]
+) -> NDArray[Any] | None:
+    """Columns of several files, or what takes their place in files without; None if no file has them."""
+    if all(block is None for block in blocks):
         return None
-    if without:
-        raise FormatError("has no column board as other files do; give it in all or none", without[0])
-    return _joined([_views_of_file(table) for table in tables])
+    both = zip(tables, blocks, strict=True)
+    return _joined([otherwise(table) if block is None else block for table, block in both])
+
+
+def _without(name: str) -> Callable[[Table], NoReturn]:
+    def refuse(table: Table) -> NoReturn:
+        raise FormatError(f"has no {name} as other files do; give it in all or none", table.source)
+
+    return refuse
 
 
 def _told_apart(table: Table) -> Table:
@@ -334,17 +348,8 @@ def _check_one_camera(tables: list[Table]) -> None:
         )
 
 
-def _covariance(tables: list[Table]) -> Array | None:
-    """(N, 3) covariance from the columns sigma or suu, suv, svv, which all files or none must have."""
-    blocks = [_covariance_of(table) for table in tables]
-    present = [block for block in blocks if block is not None]
-    if present and len(present) < len(blocks):
-        without = next(table.source for table, block in zip(tables, blocks, strict=True) if block is None)
-        raise FormatError("has no sigma (or suu,suv,svv) as other files do; give it in all or none", without)
-    return _joined(present) if present else None
-
-
-def _covariance_of(table: Table) -> Array | None:
+def _covariance(table: Table) -> Array | None:
+    """(N, 3) covariance from the columns sigma or suu, suv, svv."""
     if "sigma" not in table.numbers:
         return _together(table, OPTIONAL["covariance"])
     if any(name in table.numbers for name in OPTIONAL["covariance"]):
@@ -369,12 +374,3 @@ def _together(table: Table, names: tuple[str, ...]) -> Array | None:
             table.source,
         )
     return table.stack(names) if given else None
-
-
-def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
-    """Columns of several files, zero for files without them; None if no file has them."""
-    blocks = [_together(table, names) for table in tables]
-    if all(block is None for block in blocks):
-        return None
-    known = zip(tables, blocks, strict=True)
-    return _joined([np.zeros((len(table), len(names))) if one is None else one for table, one in known])
