@@ -19,7 +19,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.exchange.corner_texts import corner_text
 from neurocal_cli.files.exchange.corners import read_corners
-from neurocal_cli.files.exchange.matlab import saved
+from neurocal_cli.files.exchange.mat_file import saved
 
 BOARD = Board.single(5, 4, 25.0)
 SIZE = ["--cols", 5, "--rows", 4, "--square", 25]

@@ -11,7 +11,8 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import storage_text
 from neurocal_cli.files.exchange.dictionary import json_text, npz_bytes
-from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, saved
+from neurocal_cli.files.exchange.mat_file import saved
+from neurocal_cli.files.exchange.matlab import FIRST_PIXEL
 from neurocal_cli.files.points_csv import format_points
 from neurocal_cli.files.yaml_text import number
 from neurocal_cli.observations.points import Correspondences

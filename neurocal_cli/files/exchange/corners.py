@@ -37,7 +37,8 @@ from neurocal_cli.files.exchange.corner_tables import (
 )
 from neurocal_cli.files.exchange.document import array_of, arrays_of, camera_matrix, few_numbers
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
+from neurocal_cli.files.exchange.mat_file import read_variables
+from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, unit_of
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.board import Board, Plane

@@ -431,6 +431,7 @@ MULTIVIEW = table(
     pose=_FROM_FIRST,
     unit=_unit,
     finish=with_sizes_noted,
+    marks=frozenset(),
     most_cameras=99,
     rig="`rvecs, Ts`: `X_k = R X_0 + T`",
 )

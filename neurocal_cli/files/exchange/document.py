@@ -22,6 +22,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
+from neurocal_cli.files.exchange.mat_file import MARK, lists, read_variables
 from neurocal_cli.files.reading import decode, is_point_table, read_bytes
 from neurocal_cli.files.tree_fields import Field, is_number
 
@@ -119,6 +120,9 @@ class Document:
         """The tree of the file; a FormatError says what is wrong with it."""
         if self.data.startswith(b"PK\x03\x04"):
             return Field(arrays_of(self.data, self.source, self.notes), self.source)
+        if self.data.startswith(MARK):
+            self.is_script = True
+            return Field(lists(read_variables(self.data, self.source)), self.source)
         if self.array is not None:
             shape = " x ".join(map(str, self.array.shape))
             if self.array.size != 9 and self.array.shape != (4, 4):

@@ -126,7 +126,7 @@ def table(
     views: Callable[[Field], Mapping[str, Pose]] | None = None,
     finish: Callable[[CameraSet, Mapping[str, Field], Document], CameraSet] | None = None,
     project: bool = False,
-    write: Callable[[Any], str] | None = None,
+    write: Callable[[Any], str | bytes] | None = None,
     whole: Callable[[list[Tree], CameraSet], Any] | None = None,
     **properties: Any,
 ) -> Format:
@@ -178,6 +178,7 @@ def table(
         elif len(cameras) > 1:
             poses = [STILL, *map(pose.read, list(found.values())[1:])]
         alone = pose is None or (getattr(pose, "from_first", False) and len(cameras) == 1)
+        alone = alone and views is None
         frame = getattr(pose, "frame", "body")
         stated = None if alone else unit(next(iter(found.values()))) if callable(unit) else unit
         return mounted(cameras, poses, keys.program, stated, frame)
@@ -186,7 +187,8 @@ def table(
         assert write is not None
         trees = [keys.tree(camera) for camera in cameras.cameras]
         if isinstance(pose, PoseKeys) and made["most_cameras"] > 1:
-            for tree, placed in zip(trees, cameras.mounted, strict=True):
+            start = int(pose.from_first)
+            for tree, placed in zip(trees[start:], cameras.mounted[start:], strict=True):
                 pose.put(tree, placed)
         return {"": write(trees[0] if whole is None else whole(trees, cameras))}
 
