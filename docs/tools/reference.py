@@ -145,8 +145,7 @@ def _list(title: str, rows: list[tuple[str, str]]) -> list[str]:
 
 def _formats_page() -> str:
     """Each format of other programs, from the tables by which it is read and written."""
-    targets = {id(one): name for name, one in FORMATS.items()}
-    every = [*READ, *(one for one in FORMATS.values() if one not in READ)]
+    every = [*READ, *(one for one in FORMATS.values() if one.read is None)]
     rows = [
         "| program | files | `--to` | cameras | poses between them | poses of views | skew | first pixel |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -154,11 +153,10 @@ def _formats_page() -> str:
     models = ["| program | distortion models |", "| --- | --- |"]
     pixels = {0.0: "0", 0.5: "1/2", 1.0: "1"}
     for one in every:
-        name = targets.get(id(one))
         cells = [
             one.program,
             one.files,
-            f"`{name}`" if name else "read only",
+            f"`{one.to}`" if one.written else "read only",
             "any number" if one.most_cameras > 2 else str(one.most_cameras),
             (one.rig or "no") + (", in metres" if one.metres else ""),
             "yes" if one.poses else "no",

@@ -129,6 +129,16 @@ class Format:
     marks: frozenset[str] = frozenset()  # the first keys of a camera's paths
     rig: str = ""  # how the poses of several cameras are stated, for the documentation
 
+    @property
+    def to(self) -> str:
+        """The value of the option ``--to``."""
+        return {"NumPy": "npz"}.get(self.program, self.program.lower())
+
+    @property
+    def written(self) -> bool:
+        """Whether it is written."""
+        return self.text is not _not_written
+
 
 def mounted(
     cameras: Sequence[Camera],

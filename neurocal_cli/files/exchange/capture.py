@@ -63,22 +63,6 @@ def _anipose_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-ANIPOSE = table(
-    _ANIPOSE,
-    _sections,
-    "calibration.toml of anipose, freemocap",
-    parts=_anipose_parts,
-    pose=PoseKeys(("rotation:vector", "translation"), frame="world"),
-    unit=None,
-    write=toml_text,
-    whole=lambda trees, cameras: (
-        {f"cam_{k}": tree for k, tree in enumerate(trees)} | {"metadata": {"adjusted": False}}
-    ),
-    skew=True,
-    most_cameras=99,
-    needs_size=True,
-    rig="`rotation, translation` from the world to each camera",
-)
 CALISCOPE = table(
     _CALISCOPE,
     lambda document: "cameras" in document.tree and _sections(document),
@@ -95,6 +79,22 @@ CALISCOPE = table(
     metres=True,
     needs_size=True,
     rig="`rotation, translation` [m] from the world to each camera",
+)
+ANIPOSE = table(
+    _ANIPOSE,
+    _sections,
+    "calibration.toml of anipose, freemocap",
+    parts=_anipose_parts,
+    pose=PoseKeys(("rotation:vector", "translation"), frame="world"),
+    unit=None,
+    write=toml_text,
+    whole=lambda trees, cameras: (
+        {f"cam_{k}": tree for k, tree in enumerate(trees)} | {"metadata": {"adjusted": False}}
+    ),
+    skew=True,
+    most_cameras=99,
+    needs_size=True,
+    rig="`rotation, translation` from the world to each camera",
 )
 
 # EasyMocap: intri.yml with K and dist of each name, extri.yml with the poses, both from the world.

@@ -1,7 +1,6 @@
 """Formats as tables: the keys of a camera, those of its pose, where the cameras are, and what is not held.
 
-A format is added in the module of its relatives by one `table`, and by its name in `reading.READ` and perhaps
-`reading.FORMATS`:
+A format is added in the module of its relatives by one `table`, before those that are less specific:
 
     SPOT = table(
         CameraKeys(
@@ -168,7 +167,9 @@ def table(
 
     def in_poses(found: Mapping[str, Field]) -> CameraSet:
         if project:
-            return only([keys.camera(part) for part in found.values()], found, keys.program)
+            one = only([keys.camera(part) for part in found.values()], found, keys.program)
+            seen = {} if not isinstance(pose, PoseKeys) else {name: pose.read(p) for name, p in found.items()}
+            return replace(one, poses={name: own for name, own in seen.items() if own is not None})
         cameras = [keys.camera(part, name) for name, part in found.items()]
         poses: Sequence[Pose | None] = [None] * len(cameras)
         if not isinstance(pose, PoseKeys):

@@ -142,23 +142,6 @@ def _whole(trees: list[Tree], cameras: CameraSet) -> Tree:
     return {STRUCTS[1]: {**dict(zip(_OF_TWO, trees, strict=True)), **placed}}
 
 
-MATLAB = table(
-    _PARAMETERS,
-    _matches,
-    ".mat with a struct, whose first pixel is 1",
-    parts=_parts,
-    pose=_SECOND,
-    unit=lambda root: unit_of(root.value),
-    views=_views,
-    write=lambda tree: saved(arrays(tree)),
-    whole=_whole,
-    marks=frozenset(),
-    skew=True,
-    poses=True,
-    needs_size=True,
-    rig="`RotationOfCamera2`, transposed",
-)
-
 # Bouguet's toolbox: Calib_Results.mat and .m, and those of its stereo rigs.
 _SCRIPT = re.compile(r"^\s*fc(_left)?\s*=\s*\[", re.MULTILINE).search
 _VIEW = re.compile(r"(?:omc|Tc)_(\d+)").fullmatch
@@ -217,4 +200,20 @@ BOUGUET = table(
     views=_bouguet_views,
     poses=True,
     rig="`om, T` from the left to the right camera",
+)
+MATLAB = table(
+    _PARAMETERS,
+    _matches,
+    ".mat with a struct, whose first pixel is 1",
+    parts=_parts,
+    pose=_SECOND,
+    unit=lambda root: unit_of(root.value),
+    views=_views,
+    write=lambda tree: saved(arrays(tree)),
+    whole=_whole,
+    marks=frozenset(),
+    skew=True,
+    poses=True,
+    needs_size=True,
+    rig="`RotationOfCamera2`, transposed",
 )

@@ -7,16 +7,16 @@ single camera becomes its view ``body``. The centre of the first pixel is (0, 0)
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, K4, RADTAN, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, listed, table
 from neurocal_cli.files.exchange.nearest_lenses import fov
-from neurocal_cli.files.exchange.tree_paths import find, json_text, under, yaml_text
+from neurocal_cli.files.exchange.tree_paths import find, in_order, json_text, under, yaml_text
 from neurocal_cli.files.tree_fields import Field
 
 # ORB-SLAM2 and 3: keys that begin with Camera, and those of two cameras with Camera1 and Camera2. OpenVSLAM
@@ -62,6 +62,15 @@ def _storage(tree: Tree) -> str:
     return yaml_text(tree, "%YAML:1.0\n---\n")
 
 
+STELLA = table(
+    replace(_ORB, program="OpenVSLAM", model="model", size=("cols", "rows")),
+    lambda document: (
+        "Camera.model" in document.tree
+        or (isinstance(below := document.tree.get("Camera"), dict) and {"model", "setup"} <= set(below))
+    ),
+    "OpenVSLAM, stella_vslam: YAML",
+    parts=_orb_parts,
+)
 ORB_SLAM = table(
     _ORB,
     lambda document: not {"Camera.fx", "Camera1.fx"}.isdisjoint(document.tree),
@@ -73,15 +82,6 @@ ORB_SLAM = table(
     most_cameras=1,
     marks=frozenset(f"Camera.{key}" for key in ("type", "fx", "fy", "cx", "cy", "width", "height")),
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
-)
-STELLA = table(
-    replace(_ORB, program="OpenVSLAM", model="model", size=("cols", "rows")),
-    lambda document: (
-        "Camera.model" in document.tree
-        or (isinstance(below := document.tree.get("Camera"), dict) and {"model", "setup"} <= set(below))
-    ),
-    "OpenVSLAM, stella_vslam: YAML",
-    parts=_orb_parts,
 )
 
 # VINS and camodocal. Their Kannala-Brandt is r = theta + k2 theta^3 + ..., so its k2 is our k1.
@@ -303,30 +303,34 @@ _DSO = CameraKeys(
 )
 _DSO_LINES = re.compile(
     r"\A(?:(Pinhole|RadTan|EquiDistant|KannalaBrandt|FOV)\s)?((?:\s*[-+.\deE]+){5,8})"
-    r"[ \t]*\n\s*(\d+)[ \t]+(\d+)\s*\n(?:crop|full|none|fillImg|[-+.\d])"
+    r"[ \t]*\n\s*(\d+[ \t]+\d+)\s*\n(?:crop|full|none|fillImg|[-+.\d])"
 ).match
 
 
-def _read_dso(document: Document) -> CameraSet:
+def _dso_parts(document: Document) -> dict[str, Field]:
     found = _DSO_LINES(document.text)
     assert found is not None  # `matches`
-    values = Field(found[2].split(), document.source, "the first line").array(-1)
-    if len(values) < 5:
-        raise InputError("its first line must have fx, fy, cx, cy and the distortion; correct it")
-    (fx, fy, cx, cy, *k), size = values.tolist(), (int(found[3]), int(found[4]))
-    if cx < 1 and cy < 1:
-        fx, fy, cx, cy = fx * size[0], fy * size[1], cx * size[0] - 0.5, cy * size[1] - 0.5
-    model = found[1] or "FOV"
-    if model == "Pinhole" and any(k):  # DSO reads its fifth number as omega
-        model = "FOV"
-    tree = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "D": k, "model": model, "size": list(size)}
-    camera = _DSO.camera(Field(tree, document.source))
-    return CameraSet((fov(camera, k[0], document) if model == "FOV" else camera,), program="DSO")
+    root = in_order("size:2 fx fy cx cy D:", [*found[3].split(), *found[2].split()], document.source)
+    tree, (width, height) = root.value, root.value["size"]
+    if tree["cx"] < 1 and tree["cy"] < 1:
+        tree |= {"fx": tree["fx"] * width, "cx": tree["cx"] * width - 0.5}
+        tree |= {"fy": tree["fy"] * height, "cy": tree["cy"] * height - 0.5}
+    # DSO reads the fifth number of a pinhole as omega.
+    tree["model"] = "FOV" if found[1] == "Pinhole" and any(tree["D"]) else found[1] or "FOV"
+    return {"camera": root}
+
+
+def _with_omega(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
+    tree = parts["camera"].value
+    if tree["model"] != "FOV":
+        return found
+    return replace(found, cameras=(fov(found.cameras[0], tree["D"][0], document),))
 
 
 DSO = table(
     _DSO,
     lambda document: _DSO_LINES(document.text),
     "camera.txt of DSO, LDSO, TUM's monocular data",
-    read=_read_dso,
+    parts=_dso_parts,
+    finish=_with_omega,
 )

@@ -41,7 +41,7 @@ _FLIP = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 _FRAME = PoseKeys(("transform_matrix",), back=True)
 
 
-def _read_nerf(document: Document) -> CameraSet:
+def _nerf_parts(document: Document) -> dict[str, Field]:
     tree = dict(document.tree)
     frames = [frame for frame in tree.get("frames") or [] if isinstance(frame, dict)]
     own = [{key: value for key, value in frame.items() if key in _OWN} for frame in frames]
@@ -52,10 +52,10 @@ def _read_nerf(document: Document) -> CameraSet:
                 "cy at its top"
             )
         tree |= own[0]
+    root = Field(tree, document.source)
     if tree.get("is_fisheye") is True:
         tree.setdefault("camera_model", "OPENCV_FISHEYE")
     if "fl_x" not in tree:
-        root = Field(tree, document.source)
         half = 0.5 * root["camera_angle_x"].number()
         if document.size is not None:
             tree["w"], tree["h"] = document.size
@@ -71,16 +71,18 @@ def _read_nerf(document: Document) -> CameraSet:
                 f"has no {missing[0]}, and {key[:40]!r} may be it; correct its name, or remove it"
             )
     tree.setdefault("fl_y", tree["fl_x"])
-    root = Field(tree, document.source)
     for key, side in (("cx", "w"), ("cy", "h")):
         if key not in tree:
             tree[key] = 0.5 * root[side].number()
+    return {"camera": root}
+
+
+def _nerf_views(root: Field) -> dict[str, Pose]:
     poses = {}
-    for k, frame in enumerate(root["frames"].items() if "frames" in root else ()):
-        name = frame["file_path"].text() if "file_path" in frame else str(k)
+    for k, frame in enumerate(root.get("frames", []).items()):
         if (pose := _FRAME.read(frame)) is not None:
-            poses[name] = after(_FLIP, pose)
-    return CameraSet((_NERF.camera(root),), (), poses, program="nerfstudio")
+            poses[frame.get("file_path", str(k)).text()] = after(_FLIP, pose)
+    return poses
 
 
 def _with_frames(trees: list[Tree], cameras: CameraSet) -> Tree:
@@ -97,7 +99,9 @@ NERFSTUDIO = table(
         and "intrinsics" not in document.tree
     ),
     "transforms.json of nerfstudio and instant-ngp",
-    read=_read_nerf,
+    parts=_nerf_parts,
+    unit=None,
+    views=_nerf_views,
     write=json_text,
     whole=_with_frames,
     poses=True,

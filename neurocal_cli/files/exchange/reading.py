@@ -32,83 +32,14 @@ from neurocal_cli.files.exchange.camera_set import CameraSet, Format, adapt_came
 from neurocal_cli.files.exchange.document import UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.neurocal import camera_set
 
-# Formats that `convert` writes, by the values of its option ``--to``.
-FORMATS: dict[str, Format] = {
-    "neurocal": neurocal.FORMAT,
-    "opencv": dictionary.OPENCV,
-    "ros": ros.FORMAT,
-    "kalibr": calibrators.KALIBR,
-    "colmap": colmap.FORMAT,
-    "mrcal": calibrators.MRCAL,
-    "matlab": matlab.MATLAB,
-    "json": dictionary.JSON,
-    "npz": dictionary.NPZ,
-    "dlt": capture.DLT,
-    "nerfstudio": photographs.NERFSTUDIO,
-    "anipose": capture.ANIPOSE,
-    "caliscope": capture.CALISCOPE,
-    "orb-slam": odometry.ORB_SLAM,
-    "vins": odometry.VINS,
-    "basalt": odometry.BASALT,
-    "euroc": odometry.EUROC,
-    "open3d": photographs.OPEN3D,
-    "metashape": reconstruction.METASHAPE,
-    "gyroflow": photographs.GYROFLOW,
-    "lensfun": photographs.LENSFUN,
-}
-# Formats that are read, the most specific first; the last takes any dictionary of a camera.
-READ: tuple[Format, ...] = (
-    neurocal.FORMAT,
-    nearest_lenses.OCAM,
-    nearest_lenses.WOODSCAPE,
-    matlab.BOUGUET,
-    matlab.MATLAB,
-    colmap.FORMAT,
-    calibrators.MRCAL,
-    capture.CALISCOPE,
-    capture.ANIPOSE,
-    calibrators.MULTICAL,
-    calibrators.CALIB_IO,
-    calibrators.OPENICC,
-    capture.EASYMOCAP,
-    sensors.ZED,
-    sensors.OAK,
-    sensors.REALSENSE,
-    sensors.KINECT,
-    sensors.DJI,
-    datasets.KITTI,
-    datasets.ARGOVERSE,
-    datasets.NUSCENES,
-    datasets.ZOD,
-    datasets.MIDDLEBURY,
-    datasets.MVSNET,
-    datasets.KRTD,
-    datasets.DROID,
-    nearest_lenses.OPENPTV,
-    odometry.DSO,
-    odometry.EUROC,
-    calibrators.KALIBR,
-    calibrators.BOOFCV,
-    odometry.STELLA,
-    odometry.ORB_SLAM,
-    odometry.VINS,
-    odometry.BASALT,
-    odometry.OKVIS,
-    odometry.SVO,
-    odometry.VIKIT,
-    photographs.NERFSTUDIO,
-    photographs.NERFIES,
-    reconstruction.METASHAPE,
-    reconstruction.PIX4D,
-    reconstruction.OPENMVG,
-    reconstruction.ALICEVISION,
-    reconstruction.OPENSFM,
-    photographs.GYROFLOW,
-    photographs.OPEN3D,
-    ros.FORMAT,
-    dictionary.MULTIVIEW,
-    dictionary.OPENCV,
-)
+# All tables, the most specific first; the last takes any dictionary of a camera.
+_MODULES = (
+    neurocal, nearest_lenses, matlab, colmap, capture, sensors, datasets, odometry, calibrators,
+    photographs, reconstruction, ros, dictionary,
+)  # fmt: skip
+_ALL = [one for module in _MODULES for one in vars(module).values() if isinstance(one, Format)]
+READ = [one for one in _ALL if one.read is not None]
+FORMATS = {one.to: one for one in _ALL if one.written}  # by the values of the option ``--to``
 
 # What is known and cannot be read: how it begins, or how to tell it; what it is, and what to do.
 _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (

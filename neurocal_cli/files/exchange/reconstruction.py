@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import xml_root
 from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, only, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
 from neurocal_cli.files.exchange.tree_paths import in_order, under
 from neurocal_cli.files.tree_fields import Field
 
@@ -256,35 +254,33 @@ _PIX4D = CameraKeys(
 )
 _PIX4D_HEAD = re.compile(r"\A\s*fileName imageWidth imageHeight\s.*?\[R\|-Rt\] X\s*\n", re.DOTALL).match
 _PIX4D_ROWS = [3, 3, 3, 3, 3, 2, 3, 3, 3, 3]  # words of a name with its size, and numbers
-_PIX4D_POSE = PoseKeys(("R", "t"), centre=True)
-_PIX4D_ORDER = "size:2 K:9 radial:3 tangential:2 t:3 R:9"
 
 
-def _read_pix4d(document: Document) -> CameraSet:
+def _pix4d_parts(document: Document) -> dict[str, Field]:
     head = _PIX4D_HEAD(document.text)
     assert head is not None  # `matches`
     rows = [line.split() for line in document.text[head.end() :].splitlines() if line.strip()]
-    cameras, poses, unit = [], {}, len(_PIX4D_ROWS)
-    for k in range(0, len(rows), unit):
-        image = rows[k : k + unit]
-        name, *words = " ".join(image[0][:-2]), *image[0][-2:], *(word for row in image[1:] for word in row)
-        if [len(row) for row in image[1:]] != _PIX4D_ROWS[1:] or len(image[0]) < _PIX4D_ROWS[0]:
+    parts, count = {}, len(_PIX4D_ROWS)
+    for k in range(0, len(rows), count):
+        first, *rest = rows[k : k + count]
+        name = " ".join(first[:-2])
+        if [len(row) for row in rest] != _PIX4D_ROWS[1:] or len(first) < _PIX4D_ROWS[0]:
             raise InputError(f"the block of the image {name[:40]!r} is damaged; export the file again")
-        part = in_order(_PIX4D_ORDER, words, document.source)
-        cameras.append(_PIX4D.camera(part))
-        if (pose := _PIX4D_POSE.read(part)) is not None:
-            poses[name] = pose
+        words = [*first[-2:], *(word for row in rest for word in row)]
+        parts[name] = in_order("size:2 K:9 radial:3 tangential:2 t:3 R:9", words, document.source)
     document.warnings.append(
         f"{document.source}: Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
         "which may be half a pixel off"
     )
-    return replace(only(cameras, poses, "Pix4D"), poses=poses)
+    return parts
 
 
 PIX4D = table(
     _PIX4D,
     lambda document: _PIX4D_HEAD(document.text[:2000]),
     "calibrated_camera_parameters.txt",
-    read=_read_pix4d,
+    parts=_pix4d_parts,
+    pose=PoseKeys(("R", "t"), centre=True),
+    project=True,
     poses=True,
 )
