@@ -5,7 +5,7 @@ The views have an entry each, or columns in a long file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from neurocal_cli.files.key_tables import (
     record,
 )
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import block, indented, mapping, number, quoted
+from neurocal_cli.files.yaml_text import block, indented, number, quoted
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Bends, Target
 
@@ -35,21 +35,8 @@ POSE_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
 _SAME = 1e-6
 
 
-def _stated(field: Field) -> tuple[float, float | None]:
-    return field["value"].number(), field["std"].number_or_nan() if "std" in field.entries() else None
-
-
-def _stated_text(pair: tuple[float, float | None]) -> str:
-    value, std = number(pair[0]), pair[1]
-    return mapping(value=value) if std is None else mapping(value=value, std=number(std))
-
-
 _GROUPS = {
-    group: record(
-        dict,
-        Keys(", ".join(f"{name}: stated" for name in names), {"stated": inline(_stated, _stated_text)}),
-        inline=True,
-    )
+    group: record(dict, Keys(", ".join(f"{name}: stated" for name in names)), inline=True)
     for group, names in POSE_GROUPS
 }
 _VIEW = Keys(
@@ -81,16 +68,11 @@ def have_same_std(views: Mapping[str, ViewResult]) -> bool:
     return len({frozenset(view.std) for view in views.values()}) <= 1
 
 
-def second_pose_lines(views: Mapping[str, ViewResult], K: Array) -> Iterator[str]:
-    """Lines of the block ``second_poses``; none if there are none."""
-    if views:
-        yield from ["second_poses:", *list(view_lines(views, K, False))[1:]]
-
-
-def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterator[str]:
-    """Lines of the block ``views``."""
+def view_lines(key: str, pair: tuple[Mapping[str, ViewResult], Array], long: bool) -> Iterator[str]:
+    """Lines of a block of views, from these and the camera matrix."""
+    views, K = pair
     if not views:
-        yield "views: []"
+        yield f"{key}: []"
         return
     R, t = np.stack([v.pose.R for v in views.values()]), np.stack([v.pose.t for v in views.values()])
     euler = rotation_to_euler(R)
@@ -104,12 +86,14 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
             if all(name in view.std for view in each):
                 table[f"std_{name}"] = [view.std[name] for view in each]
         table |= {"name": list(views), "euler": euler, "t": t, "R": R}
-        yield from block("views", column_lines(_VIEWS.of(table)))
+        yield from block(key, column_lines(_VIEWS.of(table)))
         return
-    yield "views:"
+    yield f"{key}:"
     pose = np.hstack([euler, t]).tolist()
     for (name, view), values in zip(views.items(), pose, strict=True):
-        stated = {key: (value, view.std.get(key)) for key, value in zip(POSE_NAMES, values, strict=True)}
+        stated = {
+            one: (value, view.std.get(one), False) for one, value in zip(POSE_NAMES, values, strict=True)
+        }
         P = K @ view.pose.D
         own = {key: getattr(view, key) for key in keys} | {"name": name, "R": view.pose.R}
         own |= {"rotation": stated, "translation": stated, "projection_matrix": P}
@@ -119,66 +103,52 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
 
 
 def read_views(field: Field) -> dict[str, ViewResult]:
-    """Read the block ``views`` in either form."""
+    """Read a block of views in either form."""
     views: dict[str, ViewResult] = {}
-    if isinstance(field.value, dict):
-        table = read_columns(field, _VIEWS.labels)
-        for _, columns, optional, _ in _VIEWS.groups:
-            for name in columns:
-                if not optional:
-                    field[name]  # raises an error that names the missing column
-        if len(set(table["name"])) < len(table["name"]):
-            field["name"].fail("names that differ")
-        found = _VIEWS.values(table, field)
-        std = {name: found.pop(f"std_{name}") for name in POSE_NAMES}
-        std = {name: values.tolist() for name, values in std.items() if values is not None}
-        probability = found.pop("probability")
-        names = found.pop("name")
-        found["probability"] = np.ones(len(names)) if probability is None else probability
-        found = {key: list(values) for key, values in found.items()}
-        for k, name in enumerate(names):
-            own = {key: values[k] for key, values in found.items()}
-            R, stds = np.reshape(own.pop("R"), (3, 3)), {key: values[k] for key, values in std.items()}
-            views[name] = _view(own.pop("euler"), R, own.pop("t"), stds, own, field)
-        return views
-    for entry in field.items():
-        own = _VIEW.read(entry)
-        name = own.pop("name")
+    parts = _long_views(field) if isinstance(field.value, dict) else map(_short_view, field.items())
+    for place, name, euler, R, t, own in parts:
         if name in views:
-            entry["name"].fail("a name that no other view has")
-        stated = {**own.pop("rotation"), **own.pop("translation")}
-        del own["projection_matrix"]
-        values = np.array([value for value, _ in stated.values()])
-        stds = {key: std for key, (_, std) in stated.items() if std is not None}
-        views[name] = _view(values[:3], own.pop("R"), values[3:], stds, own, entry)
+            place["name"].fail("a name that no other view has" if "R" in place else "names that differ")
+        if np.abs(R - euler_to_rotation(*euler)).max() > _SAME:
+            both = "R and rotation" if "R" in place else "R11 to R33 and R_x, R_y, R_z"
+            place.refuse(f"{place.path}: {both} disagree; correct those edited")
+        views[name] = ViewResult(Pose(R, t), **own)
     return views
 
 
-def _view(
-    euler: Array, R: Array, t: Array, std: dict[str, float], rest: dict[str, Any], field: Field
-) -> ViewResult:
-    if np.abs(R - euler_to_rotation(*euler)).max() > _SAME:
-        both = "R and rotation" if "R" in field else "R11 to R33 and R_x, R_y, R_z"
-        field.refuse(f"{field.path}: {both} disagree; correct those edited")
-    return ViewResult(
-        Pose(R, t),
-        std,
-        int(rest["n_points"]),
-        float(rest["rmse_px"]),
-        bool(rest["fixed"]),
-        float(rest["probability"]),
-    )
+# A field for messages, the name, angles, R and t of a view, and its other values.
+_Parts = tuple[Field, str, Array, Array, Array, dict[str, Any]]
 
 
-def verdict_lines(verdict: Verdict | None) -> Iterable[str]:
-    """Lines of the block ``verdict``; none if there is no verdict."""
-    return [] if verdict is None else VERDICT.lines("verdict", verdict, False)
+def _short_view(entry: Field) -> _Parts:
+    own = _VIEW.read(entry)
+    stated = {**own.pop("rotation"), **own.pop("translation")}
+    values = np.array([value for value, *_ in stated.values()])
+    own["std"] = {key: std for key, (_, std, _) in stated.items() if std is not None}
+    return entry, own.pop("name"), values[:3], own.pop("R"), values[3:], own
+
+
+def _long_views(field: Field) -> Iterator[_Parts]:
+    table = read_columns(field, _VIEWS.labels)
+    for _, columns, optional, _ in _VIEWS.groups:
+        for name in columns:
+            if not optional:
+                field[name]  # raises an error that names the missing column
+    found = _VIEWS.values(table, field)
+    names, R = found.pop("name"), found.pop("R").reshape(-1, 3, 3)
+    place = zip(names, found.pop("euler"), R, found.pop("t"), strict=True)
+    known = {name: std.tolist() for name in POSE_NAMES if (std := found.pop(f"std_{name}")) is not None}
+    probability = found.pop("probability")
+    found["fixed"] = found["fixed"].astype(bool)
+    found["probability"] = np.ones(len(names)) if probability is None else probability
+    rest = {key: values.tolist() for key, values in found.items()}
+    for k, (name, *pose) in enumerate(place):
+        own = {key: values[k] for key, values in rest.items()}
+        yield field, name, *pose, own | {"std": {key: std[k] for key, std in known.items()}}
 
 
 def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
-    """Lines of the block ``rejected``; none if nothing was rejected."""
-    if not len(rejected) and not rejected.views:
-        return
+    """Lines of the block ``rejected``."""
     reasons = map(quoted, rejected.views.values())
     yield "rejected:"
     yield from indented(named_lines("views", rejected.views, reasons))
@@ -194,8 +164,6 @@ def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
 
 def read_rejected(field: Field, unit: str) -> Rejected:
     """Read the block ``rejected`` back."""
-    if field.value is None:
-        return Rejected()
     views = {name: entry.text() for name, entry in read_named(field["views"]).items()}
     found = _REJECTED.read(field)
     if found is None:
@@ -205,10 +173,8 @@ def read_rejected(field: Field, unit: str) -> Rejected:
         return Rejected(Correspondences(**found, unit=unit, source=field.source), error, views)
 
 
-def target_lines(target: Target | None, long: bool) -> Iterator[str]:
-    """Lines of the block ``target``; none if the target was used as given."""
-    if target is None:
-        return
+def target_lines(target: Target, long: bool) -> Iterator[str]:
+    """Lines of the block ``target``."""
     yield "target:"
     yield from indented(_TARGET_KEYS.lines(target))
     yield from indented(_TARGET.lines(target, long))

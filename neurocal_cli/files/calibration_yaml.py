@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
-from neurocal_cli.calibration.calibration import Calibration, NetworkRecord
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected
 from neurocal_cli.camera.distortion import StraightLines, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
@@ -31,17 +32,19 @@ from neurocal_cli.files.calibration_blocks import (
     read_target,
     read_views,
     rejected_lines,
-    second_pose_lines,
     target_lines,
-    verdict_lines,
     view_lines,
 )
 from neurocal_cli.files.camera_tree import camera_info_lines, image_size, read_tree
 from neurocal_cli.files.key_tables import (
     Keys,
     Kind,
+    Stated,
     column_lines,
+    inline,
+    named,
     named_lines,
+    not_read,
     read_named,
     read_numbers,
     record,
@@ -49,8 +52,7 @@ from neurocal_cli.files.key_tables import (
 from neurocal_cli.files.observations_yaml import observation_lines, read_observations
 from neurocal_cli.files.reading import is_point_table
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import block, flow, flows, mapping, number, text, words
-from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.files.yaml_text import block, flows, text
 
 FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
 
@@ -82,16 +84,6 @@ def _matrices(*shape: int) -> Kind:
     return Kind(read, lines)
 
 
-HEAD = Keys(
-    "type: integer, method: text, trainer: text, seed: integer, converged: boolean, stop_reason: text"
-)
-# lens_choice is in px, of data left out; target_stretched is a probability.
-OPTIONS = Keys("lens_choice?: measures, square_pixels?: boolean, target_stretched?: number")
-FIT = Keys(
-    "n_points: integer, n_rejected: integer, rmse_px: measure, max_px: measure",
-    n_points=lambda cal: len(cal.points),
-)
-WARNINGS = Keys("warnings: lines")
 NETWORK = record(
     NetworkRecord,
     Keys(
@@ -108,7 +100,55 @@ STRAIGHT_LINES = record(
     ),
     inline=True,
 )
-CENTRE = Keys("image_center?: pair")
+FIT = Keys(
+    "n_points: integer, n_rejected: integer, rmse_px: measure, max_px: measure",
+    n_points=lambda cal: len(cal.points),
+)
+_PARAMETERS = named("stated")
+_AS_IT_IS: Callable[[Field], Any] = lambda field: field  # noqa: E731 - read when the rest is known
+# lens_choice is in px, of data left out; target_stretched is a probability.
+_BLOCK = Keys(
+    "format: format, version: version, type: integer, method: text, trainer: text, seed: integer,"
+    "converged: boolean, stop_reason: text, unit!: unit, distortion=distortion_model!: model,"
+    "lens_choice?: measures, square_pixels?: boolean, target_stretched?: number, image_center?: pair,"
+    "parameters: parameters, covariance!: covariance, given_covariance?: covariance, fit: fit,"
+    "warnings!: lines, views: views, second_poses?: second, network!: network, verdict=judgement?: verdict,"
+    "rejected?: rejected, target?: target, straight_lines?: straight_lines, observations: observations",
+    {
+        "format": Kind(not_read, lambda key, _, long: [f"{key}: {FORMATS[long]}"]),
+        "version": Kind(not_read, lambda key, version, _: [f"{key}: {text(version)}"]),
+        "unit": inline(Field.text, text, "mm"),
+        "model": inline(Field.text, text, "none"),
+        "fit": record(dict, FIT, inline=True),
+        "views": Kind(read_views, view_lines),
+        "second": Kind(read_views, lambda key, pair, _: view_lines(key, pair, False), {}),
+        "network": Kind(
+            NETWORK.read,
+            lambda key, network, long: (
+                [f"{key}: null"] if network is None else NETWORK.lines(key, network, long)
+            ),
+        ),
+        "verdict": VERDICT,
+        "rejected": Kind(_AS_IT_IS, lambda _, rejected, long: rejected_lines(rejected, long)),
+        "target": Kind(read_target, lambda _, target, long: target_lines(target, long)),
+        "straight_lines": STRAIGHT_LINES,
+        "observations": Kind(_AS_IT_IS, lambda _, points, long: observation_lines(points, long)),
+    },
+    format=lambda cal: None,
+    version=lambda cal: __version__,
+    image_center=lambda cal: cal.points.image_center,
+    parameters=lambda cal: _parameters(cal),
+    covariance=lambda cal: {"names": cal.covariance_names, "data": cal.covariance},
+    given_covariance=lambda cal: (
+        {"names": cal.given_names, "data": cal.given_covariance} if cal.given_names else None
+    ),
+    fit=lambda cal: cal,
+    views=lambda cal: (cal.views, cal.K),
+    second_poses=lambda cal: cal.second_poses and (cal.second_poses, cal.K),
+    verdict=lambda cal: cal.verdict,
+    rejected=lambda cal: cal.rejected if len(cal.rejected) or cal.rejected.views else None,
+    observations=lambda cal: cal.points,
+)
 
 
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
@@ -123,49 +163,15 @@ def calibration_lines(
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
     long = large and not by_rows and have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
-    yield from block("neurocal", _block_lines(cal, long))
+    yield from block("neurocal", _BLOCK.lines(cal, long))
 
 
-def _block_lines(cal: Calibration, long: bool) -> Iterator[str]:
-    """Lines of the block ``neurocal``."""
-    yield f"format: {FORMATS[long]}"
-    yield f"version: {text(__version__)}"
-    yield from HEAD.lines(cal)
-    yield f"unit: {text(cal.unit)}"
-    yield f"distortion: {text(cal.distortion_model)}"
-    yield from OPTIONS.lines(cal)
-    yield from CENTRE.lines(cal.points)
-    yield from _parameter_lines(cal)
-    yield from view_lines(cal.views, cal.K, long)
-    yield from second_pose_lines(cal.second_poses, cal.K)
-    yield from ["network: null"] if cal.network is None else NETWORK.lines("network", cal.network, long)
-    yield from verdict_lines(cal.verdict)
-    yield from rejected_lines(cal.rejected, long)
-    yield from target_lines(cal.target, long)
-    if cal.straight_lines is not None:
-        yield from STRAIGHT_LINES.lines("straight_lines", cal.straight_lines, long)
-    yield from observation_lines(cal.points, long)
-
-
-def _parameter_lines(cal: Calibration) -> Iterator[str]:
+def _parameters(cal: Calibration) -> dict[str, Stated]:
     values: dict[str, float] = dict(zip(INTRINSIC_NAMES, cal.intrinsics.values().tolist(), strict=True))
     # The paper has no distortion parameters, but those with known accuracy are listed here, too.
     lens = dict(zip(coefficient_names(cal.distortion_model), cal.distortion.tolist(), strict=False))
     values.update({name: value for name, value in lens.items() if name in cal.std})
-    yield "parameters:"
-    for name, value in values.items():
-        entry = {"value": number(value)}
-        if name in cal.fixed:
-            entry["std"], entry["fixed"] = "0", "true"
-        elif name in cal.std:
-            entry["std"] = number(cal.std[name])
-        yield f"  {name}: {mapping(**entry)}"
-    yield f"covariance: {mapping(names=words(cal.covariance_names), data=flow(cal.covariance))}"
-    if cal.given_names:
-        given = mapping(names=words(cal.given_names), data=flow(cal.given_covariance))
-        yield f"given_covariance: {given}"
-    yield f"fit: {FIT.flow(cal)}"
-    yield from WARNINGS.lines(cal)
+    return {name: (value, cal.std.get(name), name in cal.fixed) for name, value in values.items()}
 
 
 # camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.
@@ -186,49 +192,45 @@ def read_calibration(path: str | Path) -> Calibration:
 def calibration_from_field(root: Field) -> Calibration:
     """Read a whole calibration from a file, or from the part ``left`` or ``right`` of a rig."""
     block = neurocal_block(root)
-    views = read_views(block["views"])
-    fit = FIT.read(block["fit"])
-    n_points = fit.pop("n_points")
-    points = _points(root, block, set(views), n_points == 0)
-    if n_points != len(points):
+    found = _BLOCK.read(block)
+    fit, rejected, center = (found.pop(key) for key in ("fit", "rejected", "image_center"))
+    points = read_observations(
+        found.pop("observations"), found.pop("unit"), image_size(root), center, fit["n_points"] == 0
+    )
+    if strange := set() if points.view is None else set(points.view_names) - set(found["views"]):
+        root.refuse(
+            f"{block.path}.observations: the view {min(strange)[:60]!r} is not in {block.path}.views; "
+            "calibrate again or correct its name"
+        )
+    if (n_points := fit.pop("n_points")) != len(points):
         root.refuse(
             f"fit.n_points is {n_points}, but there are {len(points)} observations: the file is incomplete; "
             "calibrate again"
         )
-    rejected = read_rejected(block.get("rejected"), points.unit)
-    if fit.pop("n_rejected") != len(rejected):
-        block["fit"]["n_rejected"].fail(f"{len(rejected)}, the number of rows of rejected")
-    head = HEAD.read(block)
-    if head["type"] not in (1, 2, 3, 4):
+    left_out = Rejected() if rejected is None else read_rejected(rejected, points.unit)
+    if fit.pop("n_rejected") != len(left_out):
+        block["fit"]["n_rejected"].fail(f"{len(left_out)}, the number of rows of rejected")
+    if found["type"] not in (1, 2, 3, 4):
         block["type"].fail("1, 2, 3 or 4")
-    model, coefficients = distortion_from_field(root)
+    _, coefficients = distortion_from_field(root)
     names, covariance = covariance_from_field(block, "covariance")
     given_names, given_covariance = covariance_from_field(block, "given_covariance")
     intrinsics, std, fixed = intrinsics_from_field(root)
-    return Calibration(
-        intrinsics=intrinsics,
-        std=std,
-        fixed=fixed,
-        views=views,
-        points=points,
-        **head,
-        **fit,
-        distortion_model=model,
-        distortion=coefficients,
-        covariance=covariance,
-        covariance_names=names,
-        given_covariance=given_covariance,
-        given_names=given_names,
-        network=block.read("network", NETWORK.read),
-        straight_lines=block.read("straight_lines", STRAIGHT_LINES.read),
-        camera_name=root.get("camera_name", "camera").text(),
-        warnings=tuple(block.get("warnings", []).texts()),
-        rejected=rejected,
-        target=block.read("target", read_target),
-        judgement=block.read("verdict", VERDICT.read),
-        second_poses=read_views(block.get("second_poses", [])),
-        **OPTIONS.read(block),
-    )
+    own = {
+        "intrinsics": intrinsics,
+        "std": std,
+        "fixed": fixed,
+        "points": points,
+        "rejected": left_out,
+        "distortion": coefficients,
+        "covariance": covariance,
+        "covariance_names": names,
+        "given_covariance": given_covariance,
+        "given_names": given_names,
+        "camera_name": root.get("camera_name", "camera").text(),
+    }
+    del found["parameters"]
+    return Calibration(**(found | fit | own))
 
 
 def covariance_from_field(block: Field, key: str) -> tuple[tuple[str, ...], Array]:
@@ -294,9 +296,9 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     """Read the intrinsic parameters of a neurocal file, their standard deviations, and the fixed names."""
     parameters = neurocal_block(root)["parameters"]
     values = [parameters[name]["value"].number() for name in INTRINSIC_NAMES]
-    entries = parameters.entries()
-    std = {name: entry["std"].number_or_nan() for name, entry in entries.items() if "std" in entry.entries()}
-    fixed = frozenset(name for name, entry in entries.items() if entry.get("fixed", False).boolean())
+    found: dict[str, Stated] = _PARAMETERS.read(parameters)
+    std = {name: std for name, (_, std, _) in found.items() if std is not None}
+    fixed = frozenset(name for name, (*_, fixed) in found.items() if fixed)
     try:
         intrinsics = Intrinsics(*values)
     except InputError as error:
@@ -341,16 +343,3 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
                 "was edited"
             )
     return model, coefficients[: len(names)]
-
-
-def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspondences:
-    observations = block["observations"]
-    unit = _unit(block)
-    center = CENTRE.read(block)["image_center"]
-    points = read_observations(observations, unit, image_size(root), center, none)
-    if strange := set() if points.view is None else set(points.view_names) - views:
-        root.refuse(
-            f"{observations.path}: the view {min(strange)[:60]!r} is not in {block.path}.views; "
-            "calibrate again or correct its name"
-        )
-    return points

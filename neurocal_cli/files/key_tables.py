@@ -252,6 +252,10 @@ class Kind:
     empty: Any = None
 
 
+def not_read(field: Field) -> None:
+    """The reader of a key that is only shown, as its value follows from others."""
+
+
 def inline(read: Callable[[Field], Any], write: Callable[[Any], str], empty: Any = None) -> Kind:
     """A kind whose values are texts on the line of their key."""
     return Kind(read, lambda key, value, _: [f"{key}: {write(value)}"], empty)
@@ -275,9 +279,22 @@ def _rows_of_texts(count: int = 0) -> Kind:
 
 _TRIPLES = _rows_of_texts(3)
 
+Stated = tuple[float, float | None, bool]
+
 
 def _estimate(field: Field) -> tuple[float, float]:
     return field["value"].number(), field["std"].number_or_nan()
+
+
+def _stated(field: Field) -> Stated:
+    std = field["std"].number_or_nan() if "std" in field.entries() else None
+    return field["value"].number(), std, field.get("fixed", False).boolean()
+
+
+def _stated_text(stated: Stated) -> str:
+    value, std, fixed = stated
+    entries = {"value": number(value)} | ({} if std is None else {"std": number(std)})
+    return mapping(**(entries | {"std": "0", "fixed": "true"} if fixed else entries))
 
 
 _KINDS = {
@@ -299,7 +316,7 @@ _KINDS = {
     "names": inline(lambda field: tuple(field.texts()), words),
     "sentences": inline(lambda field: tuple(field.texts()), quoted_words),
     "lines": Kind(
-        lambda field: tuple(field.texts()), lambda key, values, _: list_lines(key, map(quoted, values))
+        lambda field: tuple(field.texts()), lambda key, values, _: list_lines(key, map(quoted, values)), ()
     ),
     "rows of texts": _rows_of_texts(),
     "pairs of texts": _rows_of_texts(2),
@@ -310,7 +327,8 @@ _KINDS = {
     "estimate": inline(  # a value and its standard deviation
         _estimate, lambda pair: mapping(value=number(pair[0]), std=number(pair[1]))
     ),
-    "shown": Kind(lambda _: None, lambda key, value, _: [f"{key}: {flow(value)}"]),  # follows from the others
+    "stated": inline(_stated, _stated_text),  # the same if it is known, and whether the value was given
+    "shown": Kind(not_read, lambda key, value, _: [f"{key}: {flow(value)}"]),
     "square": inline(lambda field: field, flow),  # read as it is, for a size that is known later
 }
 
@@ -363,8 +381,9 @@ class Keys:
         """The values of the block by their attributes."""
         found = {}
         for name, attribute, optional, kind in self.keys:
-            value = field.read(name, kind.read) if optional else kind.read(field[name])
-            found[attribute] = kind.empty if value is None else value
+            if kind.read is not not_read:
+                value = field.read(name, kind.read) if optional else kind.read(field[name])
+                found[attribute] = kind.empty if value is None else value
         return found
 
 
@@ -393,3 +412,9 @@ def record(make: Callable[..., Any], keys: Keys, inline: bool = False) -> Kind:
         return [f"{key}: {keys.flow(value)}"] if inline else block(key, keys.lines(value, long))
 
     return Kind(lambda field: make(**keys.read(field)), lines)
+
+
+_KINDS |= {
+    "parameters": named("stated"),
+    "covariance": record(dict, Keys("names: names, data: square"), inline=True),
+}

@@ -87,7 +87,8 @@ def _lines(lens: ZoomLens) -> Iterator[str]:
             yield from indented(block(name, _NET.lines(net)), 6)
     for name, table in (("tables", lens.tables), ("static", lens.static)):
         yield from block(name, _TABLE.lines(table))
-    yield from target_lines(lens.target, long=False)
+    if lens.target is not None:
+        yield from target_lines(lens.target, long=False)
     if lens.target_coupling is not None:
         yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
 

@@ -43,7 +43,6 @@ _POSE = Keys(
     f"translation: translation, covariance: covariance, {RESULT}, delay?: delay",
     {
         **{group: record(dict, keys, inline=True) for group, keys in _GROUPS.items()},
-        "covariance": record(dict, Keys("names: names, data: square"), inline=True),
         "delay": record(dict, Keys("value: number, std: measure, timed: boolean"), inline=True),
     },
     baseline_std=lambda rig: rig.std["baseline"],
