@@ -123,19 +123,6 @@ def fisheye_sizes(far: float) -> Array:
     return np.array([share / far**power for _, power, share in _FISHEYE])
 
 
-def log_prior(state: CameraState, first: int, reach: float) -> float:
-    """Logarithm of the prior density of the coefficients of a polynomial model, from the `first` on.
-
-    A uniform density of 1, which the evidence of a target has for all cameras, is far too wide for them.
-    `first` is the number of coefficients that are not counted. `state` is normalised, and `reach` is the
-    `radius` of the farthest point.
-    """
-    names = coefficient_names(state.model)
-    size = {name: share / reach**power for members, power, share in _POLYNOMIAL for name in members}
-    width = _SCALES[0] * np.array([size[name] for name in names[first:]])
-    return float(-(0.5 * (state.k[first:] / width) ** 2 + np.log(np.sqrt(2 * np.pi) * width)).sum())
-
-
 def open_coefficients(
     model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
 ) -> OpenCoefficients | None:

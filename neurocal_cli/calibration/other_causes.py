@@ -13,7 +13,7 @@ reason for which it was left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, replace
 
 import numpy as np
@@ -35,7 +35,7 @@ from neurocal_cli.calibration.verdict.findings import LEVEL, pixel_spread
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates
-from neurocal_cli.calibration.verdict.rivals import RIVALS
+from neurocal_cli.calibration.verdict.rivals import RIVALS, TOO_SIMPLE
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -89,6 +89,21 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
         return held.evidence * worth > gain + LEVEL
     # A shape that is far more probable than the found one is not open: no print is stretched by percents.
     return held.causes[0].pattern == "all" and worth * sum(one.evidence for one in held.causes) > _FAR * gain
+
+
+def lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
+    """Whether more distortion coefficients are more probable than a target found with the same lenses.
+
+    Each camera is at its minimum for the given target.
+    """
+    fits = views_for_target(fits)
+    held = [
+        contest(problem.views, adjusted.state, problem.free_camera, problem.free_poses,
+                problem.points.image_size)
+        for problem, adjusted in fits
+    ]  # fmt: skip
+    of_lens = [one.evidence for one in held if one and one.causes and one.causes[0].rival.cause == TOO_SIMPLE]
+    return sum(of_lens) > gain_over_given(found, fits)
 
 
 def contradicts_sigma(solution: Solution) -> bool:

@@ -38,11 +38,13 @@ from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_intrinsics
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.lens_choice.model_selection import (
-    find_lens_and_target,
-    named_lens_is_too_simple,
+from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
+from neurocal_cli.calibration.other_causes import (
+    has_other_cause,
+    lens_is_too_simple,
+    may_be_bent,
+    other_causes,
 )
-from neurocal_cli.calibration.other_causes import has_other_cause, may_be_bent, other_causes
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
 from neurocal_cli.camera.geometry import Array, median
@@ -75,7 +77,7 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     if found is None:
         return None
     doubtful = named and known is None and choice == "auto"
-    return None if doubtful and named_lens_is_too_simple(fits, found) else found.target
+    return None if doubtful and lens_is_too_simple(fits, found) else found.target
 
 
 def _common_survey(cameras: Sequence[Calibration]) -> Target | None:

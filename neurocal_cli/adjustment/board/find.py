@@ -151,7 +151,15 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
 
     It is -inf if the points do not determine the cameras.
     """
-    return evidence_of_views(views_for_target(fits))
+    of_cameras = []
+    for problem, adjusted in views_for_target(fits):
+        views, no_label = problem.views, np.zeros(0, dtype=np.intp)
+        normal, all_views = views.pixel_scale**2 * adjusted.normal, np.ones(views.n_views, dtype=bool)
+        of_cameras.append(of_views(sight_of(problem, adjusted, no_label), normal, all_views))
+    try:
+        return evidence_of_given(*of_cameras)
+    except np.linalg.LinAlgError:
+        return -np.inf
 
 
 def gain_over_given(found: Found, fits: Sequence[tuple[Problem, Adjusted]]) -> float:
@@ -177,19 +185,6 @@ def counted_again(found: Found, fits: Sequence[tuple[Problem, Adjusted]]) -> flo
 def views_for_target(fits: Sequence[tuple[Problem, Adjusted]]) -> Sequence[tuple[Problem, Adjusted]]:
     """The fits, with the views from which a target would be estimated."""
     return _few_enough(fits, None) or fits
-
-
-def evidence_of_views(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
-    """Log evidence of the given target, of all views; -inf if the points do not determine the cameras."""
-    of_cameras = []
-    for problem, adjusted in fits:
-        views, no_label = problem.views, np.zeros(0, dtype=np.intp)
-        normal, all_views = views.pixel_scale**2 * adjusted.normal, np.ones(views.n_views, dtype=bool)
-        of_cameras.append(of_views(sight_of(problem, adjusted, no_label), normal, all_views))
-    try:
-        return evidence_of_given(*of_cameras)
-    except np.linalg.LinAlgError:
-        return -np.inf
 
 
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:

@@ -29,12 +29,10 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.board.find import Found, evidence_of_views, find_target, views_for_target
+from neurocal_cli.adjustment.board.find import Found, find_target
 from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
-from neurocal_cli.adjustment.open_choices import log_prior, radius
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.adjustment.reprojection import camera_columns, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.adjustment.views import Views
@@ -49,7 +47,7 @@ from neurocal_cli.calibration.lens_choice.candidate_models import (
 )
 from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, FEW_VIEWS, Starts
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, coefficient_names
+from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.target import Target
 
@@ -332,63 +330,6 @@ def richer_lens_is_better(found: Found) -> bool:
     return _with_other_lens(found, 1, found.target.flat, found.evidence + _RICHER) is not None
 
 
-def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
-    """Whether more distortion coefficients and the given target fit better than the found target.
-
-    Each camera is at its minimum for the given target, and `found` has the same lenses.
-    """
-    fits, end = views_for_target(fits), len(POLYNOMIAL_MODELS)
-    places = [_PLACES.get(a.state.model, end) if problem.free[0] else end for problem, a in fits]
-    if min(places) >= end - 1:
-        return False
-    least = 0.5 * (evidence_of_views(fits) + found.evidence)
-    richest = [
-        _linearised_with(*fit, POLYNOMIAL_MODELS[-1]) if own < end else fit
-        for fit, own in zip(fits, places, strict=True)
-    ]
-    for place in range(min(places) + 1, end):
-        model = POLYNOMIAL_MODELS[place]
-        richer = [
-            _without_last(*linearised, model) if own < place else fit
-            for fit, linearised, own in zip(fits, richest, places, strict=True)
-        ]
-        # A linear prediction that reaches less than half of the found target's gain settles it.
-        if not evidence_of_views(richer) + _log_prior_of_added(fits, richer) > least:
-            continue
-        richer = [
-            _adjusted_with(*fit, model) if own < place else fit for fit, own in zip(fits, places, strict=True)
-        ]
-        if evidence_of_views(richer) + _log_prior_of_added(fits, richer) > found.evidence:
-            return True
-    return False
-
-
-def _log_prior_of_added(
-    fits: Sequence[tuple[Problem, Adjusted]], richer: Sequence[tuple[Problem, Adjusted]]
-) -> float:
-    """Log prior density of the coefficients that the richer lenses have beyond the others."""
-    return sum(
-        log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
-        for (_, before), (problem, after) in zip(fits, richer, strict=True)
-    )
-
-
 def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
     new = problem.with_model(model)
     return new, new.adjust(adjusted.state.with_model(model))
-
-
-def _linearised_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
-    """A richer model with the same distortion, not adjusted, with its normal matrix there."""
-    state = adjusted.state.with_model(model)
-    normal, _ = normal_blocks(problem.views.batches, state)
-    return problem.with_model(model), replace(adjusted, state=state, normal=normal)
-
-
-def _without_last(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
-    """A simpler model's linearisation from that of a richer one, whose last coefficients are left out."""
-    n = len(coefficient_names(model))
-    kept = np.append(np.arange(camera_columns(n)[-1] + 1), -1)
-    state = replace(adjusted.state, model=model, k=adjusted.state.k[:n])
-    normal = adjusted.normal[:, kept[:, None], kept]
-    return problem.with_model(model), replace(adjusted, state=state, normal=normal)

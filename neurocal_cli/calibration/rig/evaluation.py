@@ -373,12 +373,11 @@ class _Evaluator:
             max(median(np.array(turned)), median(aside)) < _SAME_DIRECTION
             and abs(np.log(ratio)) > _OTHER_SIZE
         ):
-            units = units_mixed(max(ratio, 1 / ratio))
-            mixed = f", as with {units} mixed" if units else ""
             yield (
                 grade,
                 f"with the given points the baseline is {ratio:.3g} times that of the rig: X,Y,Z have "
-                f"another unit{mixed}, the squares another size, or a camera slid along the baseline",
+                f"another unit{units_mixed(ratio)}, the squares another size, or a camera slid along the "
+                "baseline",
                 "check the unit of X,Y,Z and the size of the squares",
             )
 

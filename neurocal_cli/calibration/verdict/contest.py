@@ -28,7 +28,7 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
-from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS, SHAPES
+from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS, SHAPES, TOO_SIMPLE
 from neurocal_cli.calibration.verdict.words import DETERMINE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -246,7 +246,7 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
     of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
-    if (of_given or one.rival.cause == "a lens that is too simple") and one.explained > _MUCH:
+    if (of_given or one.rival.cause == TOO_SIMPLE) and one.explained > _MUCH:
         added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
         fit = adjust(views.batches, state, free, True, NEARBY)

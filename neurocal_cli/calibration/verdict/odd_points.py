@@ -29,8 +29,7 @@ _NORMALISED = 2.0  # coordinates below this are normalised; no image is that sma
 _SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
 _SHARED = 0.5  # share of a view's points that other views show as well: the same target, only partly seen
 _MOST_POINTS = 400  # most points of a view that are used
-_ROUND, _ROUGHLY = 0.01, 0.3  # relative difference within which a ratio is one of two units
-_MANY = 5.0  # ratio of the spacing of points for which targets of two sizes are no likely cause
+_ROUND = 0.01  # relative difference within which a ratio is one of two units
 _UNITS = {
     25.4: "inches and millimetres",
     10.0: "centimetres and millimetres",
@@ -210,35 +209,18 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
         yield (
             1,
             f"{name_some(names)}: the points lie {float(f'{factor:.3g}'):g} times "
-            f"{'farther apart' if ratio > 0 else 'closer together'} than in the other views"
-            + (f", as with {unit} mixed" if unit else ""),
+            f"{'farther apart' if ratio > 0 else 'closer together'} than in the other views{unit}",
             "give X,Y,Z of all views in one unit"
             if unit
             else "check the unit of X,Y,Z and the size of the squares in these views",
         )
 
 
-def units_mixed(factor: float, within: float = _ROUND) -> str:
-    """The two units of length whose ratio is nearest to this factor above 1; "" if none is this near."""
+def units_mixed(factor: float) -> str:
+    """What is added to this ratio of lengths if it is that of two units; "" if it is not."""
+    factor = max(factor, 1 / factor)
     known = min(_UNITS, key=lambda ratio: abs(factor / ratio - 1))
-    return _UNITS[known] if abs(factor / known - 1) < within else ""
-
-
-def view_of_another_unit(points: Correspondences) -> str:
-    """What is odd about the view whose points are spaced many times wider or closer than in most; or "".
-
-    The targets of the views may differ in size.
-    """
-    step = _steps(worlds_by_view(points))
-    ratio = step / median(step)
-    odd = int(np.argmax(np.abs(np.log(ratio))))
-    factor = float(max(ratio[odd], 1 / ratio[odd]))
-    if not factor > _MANY:
-        return ""
-    how, unit = "farther apart" if ratio[odd] > 1 else "closer together", units_mixed(factor, _ROUGHLY)
-    return f"the points of {points.view_names[odd]} lie {factor:.2g} times {how} than in most views" + (
-        f", as with {unit} mixed" if unit else ""
-    )
+    return f", as with {_UNITS[known]} mixed" if abs(factor / known - 1) < _ROUND else ""
 
 
 def worlds_by_view(points: Correspondences) -> list[Array]:

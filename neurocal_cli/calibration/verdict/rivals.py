@@ -28,11 +28,13 @@ _FLAT = "use a board that is flat, or measure its shape and give X,Y,Z as measur
 _STIFF = "fix the target to something stiff"
 _STILL = "keep camera and target still, or use a camera with a global shutter"
 _WHOLE = "give the images as the sensor has them, or calibrate each half as a camera of its own"
+TOO_SIMPLE = "a lens that is too simple"
+"""Name of the cause that the lens lacks coefficients."""
 
 RIVALS: tuple[Rival, ...] = (
     *(
         Rival(
-            "a lens that is too simple",
+            TOO_SIMPLE,
             "residuals that grow towards the corners in the same way in all views",
             "give --distortion auto, or a model with more coefficients",
             words.too_simple(model),

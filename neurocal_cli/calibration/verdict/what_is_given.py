@@ -183,7 +183,7 @@ def unlike_axes(found: Proportions) -> str:
     return (
         f"the points fit a board whose {axis} is {float(f'{found.factor:.3g}'):g} times as long as given "
         f"({found.rmse_px:.3g} px rms{instead}): {axis} and {found.other} have "
-        f"different units{f', as with {units} mixed' if units else ''}, or its squares are not square"
+        f"different units{units}, or its squares are not square"
     )
 
 

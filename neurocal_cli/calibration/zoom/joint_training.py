@@ -33,7 +33,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
-from neurocal_cli.calibration.verdict.odd_points import view_of_another_unit
+from neurocal_cli.calibration.verdict.odd_points import views_of_another_scale
 from neurocal_cli.calibration.zoom.initialisation import (
     CalibratedSettings,
     FitOptions,
@@ -260,7 +260,8 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     valid = are_cameras(each).all(axis=0)
     if not valid.all():
         where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
-        why = view_of_another_unit(start.lens.points) or f"the networks give no camera at {where}"
+        of_scale = views_of_another_scale(start.lens.points)
+        why = next((reason for _, reason, _ in of_scale), f"the networks give no camera at {where}")
         raise DegenerateGeometryError(
             f"no lens fits all the settings: {why}; check the names, the unit of X,Y,Z and the image size of "
             "every setting"
