@@ -13,7 +13,7 @@ reason for which it was left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import field, replace
 
 import numpy as np
@@ -30,11 +30,11 @@ from neurocal_cli.calibration.lens_choice.model_selection import (
 )
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.effects import bends, common
-from neurocal_cli.calibration.verdict.findings import LEVEL, pixel_spread
-from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
+from neurocal_cli.calibration.verdict.effects import BENDS, bends, common
+from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds, pixel_spread
+from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.noise import stated_noise
-from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates
+from neurocal_cli.calibration.verdict.rival import estimates
 from neurocal_cli.calibration.verdict.rivals import RIVALS, TOO_SIMPLE
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -52,22 +52,13 @@ _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.
 # Of one view.
 _HOLDS = 2.0  # times the rms error of the other views
 _STARTS = 20
-_ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
 _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
-_CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
+_ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
 _BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 
 
-def _of_one_view(cause: str, places: tuple[int, ...]) -> Rival:
-    """A rival as that of a single view, in which these of the given entries of A change over alpha_u."""
-    rival = next(one for one in RIVALS if one.cause == cause)
-    steps = (lambda lin: lin.state.entries[0, 0] * np.eye(lin.width)[:, places]) if places else None
-    return replace(rival, patterns=common, steps=steps)
-
-
-_ZOOMED, _MOVED = _of_one_view("a zoom that moves", _FOCAL), _of_one_view("image stabilisation", _CENTRE)
-_BENT = _of_one_view("a target that is bent in one view", ())
+_BENT = replace(next(one for one in RIVALS if one.effect is bends), patterns=common)
 
 
 def has_other_cause(solution: Solution, found: Found) -> bool:
@@ -152,27 +143,30 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
         return otherwise
     limit, start = _HOLDS * rmse_px, _pose(points, camera)
     plain = _fit(points, start)
-    if start is None or plain.rms == np.inf:
-        return next((why for why, other, _ in _mistakes(points, camera) if other < limit), otherwise)
+    mistakes = list(_mistakes(points, camera))
+    if start is None or plain.state is None:
+        return next((reason for reason, rms, _ in mistakes if rms < limit), otherwise)
+
+    def odds(rms: float, unknowns: int = 0) -> float:
+        """Errors below the other views' do not count."""
+        before, after = (max(error, rmse_px) ** 2 for error in (plain.rms, rms))
+        return log_odds(before, after, 2 * len(points) - 6, unknowns) if np.isfinite(rms) else -np.inf
+
+    # A turned image needs no unknowns, so it is more probable than a crop that looks the same by chance.
+    known = [(rms, odds(rms / scale), reason) for reason, rms, scale in mistakes]
     zoomed, moved = (_fit(points, start, some) for some in (_FOCAL, _CENTRE))
+    times = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
+    if abs(times[0] / times[1] - 1) < _ALIKE:
+        how = f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
+        known.append((zoomed.rms, odds(zoomed.rms, 2), how + _or_bent(abs(times[0] - 1))))
+    how = f"it fits another camera or crop: the image centre ({moved.entries[3]:.0f}, {moved.entries[4]:.0f})"
+    shift = float(np.hypot(*(moved.entries[3:] - np.array(camera.entries)[3:])))
+    known.append((moved.rms, odds(moved.rms, 2), how + _or_bent(shift / camera.entries[0])))
+    least = LEVEL + max(odds(_rms_if_bent(points, plain.state), len(BENDS)), 0.0)
+    likely = [(evidence, reason) for rms, evidence, reason in known if rms < limit and evidence > least]
+    if likely:
+        return max(likely)[1]
     free = _fit(points, start, (*_FOCAL, *_CENTRE)).rms
-    odds = _Odds.of(points, plain, rmse_px)
-    bent = max(odds.evidence(_BENT), 0.0)
-    of_zoom, of_crop = odds.evidence(_ZOOMED, zoomed.rms), odds.evidence(_MOVED, moved.rms)
-    least = max(bent + LEVEL, of_zoom, of_crop)
-    for reason, other, scale in _mistakes(points, camera):
-        if other < limit and odds.of_error(other / scale) > least:
-            return reason
-    if zoomed.rms < limit and of_zoom > bent + LEVEL:
-        scale = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
-        if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
-            how = f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
-            return how + _or_bent(abs(scale[0] - 1))
-    if moved.rms < limit and of_crop > bent + LEVEL:
-        entries = moved.entries
-        how = f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
-        shift = float(np.hypot(*(entries[3:] - np.array(camera.entries)[3:])))
-        return how + _or_bent(shift / camera.entries[0])
     if free > _BLURRED * pixel_spread(points):
         return otherwise
     if plain.rms < _HOLDS * free:
@@ -181,42 +175,13 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
 
 
-@frozen_dataclass(eq=False)
-class _Odds:
-    """Evidence over nothing of what is wrong with one view, by the rule of all causes.
-
-    A turned image needs no unknowns, so it is more probable than a crop that looks the same by chance. Errors
-    below the other views' do not count.
-    """
-
-    lin: Linearised  # at the view's pose
-    found: Mapping[str, Estimate]  # by cause
-    points: int
-    least: float  # rms error of the other views [px]
-
-    @classmethod
-    def of(cls, points: Correspondences, plain: _Fitted, rmse_px: float) -> _Odds:
-        assert plain.state is not None
-        views, given = arrange(points), np.zeros(5 + plain.state.k.shape[-1], dtype=bool)
-        lin = linearised(views, plain.state, given, True, (bends,), points.image_size, richer=False)
-        found = estimates(lin, lin.spare, (_ZOOMED, _MOVED, _BENT), -np.inf)
-        return cls(lin, {one.rival.cause: one for one in found}, len(points), rmse_px)
-
-    def of_error(self, rms: float) -> float:
-        """Evidence of what leaves an rms error [px] without any unknowns."""
-        return 0.5 * self.lin.spare * float(np.log(self.lin.cost / self._cost(rms)))
-
-    def evidence(self, rival: Rival, rms: float | None = None) -> float:
-        """Evidence of a rival, which leaves an rms error [px], by default that of its linearisation."""
-        one = self.found.get(rival.cause)
-        if one is None:
-            return -np.inf
-        left = (1.0 - one.explained) * self.lin.cost
-        after = max(left, self._cost(self.least)) if rms is None else self._cost(rms)
-        return one.evidence + 0.5 * self.lin.spare * float(np.log(left / after))
-
-    def _cost(self, rms: float) -> float:
-        return self.points * (max(rms, self.least) / self.lin.views.pixel_scale) ** 2
+def _rms_if_bent(points: Correspondences, state: CameraState) -> float:
+    """Rms error [px] that a bend of the target leaves in one view, linearised; infinite without a board."""
+    views, given = arrange(points), np.zeros(5 + state.k.shape[-1], dtype=bool)
+    lin = linearised(views, state, given, True, (bends,), points.image_size, richer=False)
+    found = estimates(lin, lin.spare, (_BENT,), -np.inf)
+    left = (1.0 - found[0].explained) * lin.cost if found else np.inf
+    return float(np.sqrt(left / len(points))) * views.pixel_scale
 
 
 def _mistakes(points: Correspondences, camera: Camera) -> Iterator[tuple[str, float, float]]:

@@ -39,7 +39,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.verdict.contest import contest, given_camera
 from neurocal_cli.calibration.verdict.effects import stretch
-from neurocal_cli.calibration.verdict.findings import CONTRADICTION, LEVEL, Finding
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION, EXPLAINED, LEVEL, Finding
 from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import estimates
@@ -128,8 +128,6 @@ _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
 _FEWEST_VIEWS, _FEWEST_POINTS = 4, 6  # one view more than the unknowns need
 _ENOUGH_VIEWS, _STARTS = 40, 20
 _AWAY = 0.02  # least difference from 1; prints are less off, and boards of such small errors fit
-_LEFT = 0.25  # squared error over that as given
-_FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 _GRID_FITS = 0.03  # rms error of a homography over the spread of the pixels; lenses leave less
 _GRID_BETTER = 5.0  # times smaller than the error with the rows as given
@@ -166,7 +164,7 @@ def proportions(points: Correspondences) -> Proportions | None:
         return None
     given = _fitted(points, axes[0], 1.0)
     rms, given_px = (np.inf if one is None else _rms(one) for one in (found, given))
-    if not rms < min(np.sqrt(_LEFT) * given_px, _FITS * float(points.pixels.std())):
+    if not rms**2 < (1.0 - EXPLAINED) * given_px**2:
         return None
     first, second = ("XYZ"[axis] for axis in axes)
     return (
