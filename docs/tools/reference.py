@@ -145,7 +145,7 @@ def _list(title: str, rows: list[tuple[str, str]]) -> list[str]:
 
 def _formats_page() -> str:
     """Each format of other programs, from the tables by which it is read and written."""
-    every = [*READ, *(one for one in FORMATS.values() if one.read is None)]
+    every = [*READ, *(one for one in FORMATS.values() if not one.is_read)]
     rows = [
         "| program | files | `--to` | cameras | poses between them | poses of views | skew | first pixel |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -156,7 +156,7 @@ def _formats_page() -> str:
         cells = [
             one.program,
             one.files,
-            f"`{one.to}`" if one.written else "read only",
+            f"`{one.to}`" if one.is_written else "read only",
             "any number" if one.most_cameras > 2 else str(one.most_cameras),
             (one.rig or "no") + (", in metres" if one.metres else ""),
             "yes" if one.poses else "no",

@@ -207,12 +207,11 @@ def _read(
     what: str | None,
 ) -> Correspondences | CameraSet:
     """The points of the files or, if they hold none, the cameras; with values that the files lack."""
-    from neurocal_cli.files.exchange.colmap import is_folder
     from neurocal_cli.files.exchange.corners import read_corners
 
     notes: list[str] = []
     points = None
-    if what != "camera" and not is_folder(files[0]):
+    if what != "camera" and not os.path.isdir(files[0]):
         points = read_corners(files, board, notes, unit, what)
     note(*notes)
     if points is not None:

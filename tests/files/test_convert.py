@@ -362,9 +362,11 @@ def test_binary_models_of_colmap_are_those_of_its_text(tmp_path: Path) -> None:
         same(one, other, 1e-12)
     same_pose(found.relative[0], expected.relative[0], tolerance=1e-12)
     assert list(found.poses) == list(expected.poses)
-    (tmp_path / "binary" / "images.bin").write_bytes(b"".join(packed["images"])[:-5])
-    with pytest.raises(FormatError, match=r"images.bin: is a damaged images.bin of COLMAP"):
-        read_cameras([tmp_path / "binary"])
+    whole, count = b"".join(packed["images"]), struct.pack("<Q", 1)
+    for damaged in (whole[:-5], whole.replace(count, struct.pack("<Q", 2**63))):  # cut off; too many points
+        (tmp_path / "binary" / "images.bin").write_bytes(damaged)
+        with pytest.raises(FormatError, match=r"images.bin: is a damaged images.bin of COLMAP"):
+            read_cameras([tmp_path / "binary"])
 
 
 def test_colmap_gets_names_without_blanks(tmp_path: Path) -> None:

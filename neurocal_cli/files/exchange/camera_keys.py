@@ -52,6 +52,8 @@ class CameraKeys:
     skew: str = ""
     aspect: str = ""  # of fy over fx, where the intrinsics have fx for both
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
+    from_middle: bool = False  # whether the principal point is counted from the middle of the image
+    by_longer_side: bool = False  # whether all are divided by the longer side of the image
     constants: Mapping[str, Any] = field(default_factory=dict)  # written as they are
     optional: str = ""  # which coefficients a file may lack: all at once, or any
     aside: tuple[str, ...] = ()  # other numbers beside those of the camera
@@ -88,10 +90,14 @@ class CameraKeys:
             K[1, 1] *= at(root, self.aspect).number()
         if self.skew and (skew := find(root, self.skew)) is not None:
             K[0, 1] = skew.number()
-        K[:2, 2] -= self.first_pixel
+        size = self.image_size(root)
+        if size is None and (self.from_middle or self.by_longer_side):
+            at(root, self.size[0]).fail("the size of the images")
+        K[:2] *= max(size or (1,)) if self.by_longer_side else 1.0
+        K[:2, 2] += (0.5 * np.array(size) if self.from_middle else 0.0) - self.first_pixel
         if self.name and (stated := find(root, self.name)) is not None:
             name = stated.text()
-        return Camera(Intrinsics.from_matrix(K), self._distortion(root, lens), self.image_size(root), name)
+        return Camera(Intrinsics.from_matrix(K), self._distortion(root, lens), size, name)
 
     def image_size(self, root: Field) -> tuple[int, int] | None:
         """Width and height; None if they are not there, or 0."""
@@ -208,7 +214,8 @@ class CameraKeys:
         distortion = with_model(camera.distortion, lens.ours)
         assert distortion is not None
         a, skew, b, u0, v0 = camera.entries
-        u0, v0 = u0 + self.first_pixel, v0 + self.first_pixel
+        width, height = (camera.image_size or (0, 0)) if self.from_middle else (0, 0)
+        u0, v0 = u0 - 0.5 * width + self.first_pixel, v0 - 0.5 * height + self.first_pixel
         tree: dict[str, Any] = {}
         for path, value in self.constants.items():
             put(tree, path, value)

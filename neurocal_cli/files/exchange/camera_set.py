@@ -104,6 +104,10 @@ def _not_written(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
     raise InputError(f"files like that of {cameras.program} are not written; choose another format")
 
 
+def _not_read(document: Document) -> CameraSet:
+    raise InputError("files of this format are not read; give another")
+
+
 @frozen_dataclass
 class Format:
     """A file format: what it is like, how it is recognised and read, and how cameras that fit it are written.
@@ -115,8 +119,8 @@ class Format:
     models: tuple[str, ...] = ()  # our names of its distortion models, the simplest first
     # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
     text: Callable[[CameraSet, str], Mapping[str, str | bytes]] = _not_written
-    matches: Callable[[Document], object] | None = None
-    read: Callable[[Document], CameraSet] | None = None
+    matches: Callable[[Document], object] = lambda _: False
+    read: Callable[[Document], CameraSet] = _not_read
     files: str = ""  # its files, for the documentation
     skew: bool = False  # whether its programs support skew
     poses: bool = False  # whether it contains the poses of views
@@ -135,9 +139,14 @@ class Format:
         return {"NumPy": "npz"}.get(self.program, self.program.lower())
 
     @property
-    def written(self) -> bool:
+    def is_written(self) -> bool:
         """Whether it is written."""
         return self.text is not _not_written
+
+    @property
+    def is_read(self) -> bool:
+        """Whether it is read."""
+        return self.read is not _not_read
 
 
 def mounted(

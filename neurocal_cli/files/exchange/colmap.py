@@ -81,12 +81,7 @@ _KEYS = CameraKeys(
 )
 
 
-def is_folder(name: str) -> bool:
-    """Whether this is a folder, which only COLMAP uses for its models."""
-    return name != "-" and os.path.isdir(name)
-
-
-def read_folder(folder: str) -> CameraSet:
+def _read_folder(folder: str) -> CameraSet:
     """Read the cameras of a model with their relative poses and the poses of the images."""
     lines, source = _file(folder, "cameras")
     if lines is None:
@@ -103,9 +98,9 @@ def read_folder(folder: str) -> CameraSet:
 
 
 def is_cameras(document: Document) -> bool:
-    """Whether this is ``cameras.txt``, ``cameras.bin`` or a dictionary of a camera."""
+    """Whether this is a folder, ``cameras.txt``, ``cameras.bin`` or a dictionary of a camera."""
     data = document.data
-    if _stated_model(document) is not None or _sensors(document) is not None:
+    if document.is_folder or _stated_model(document) is not None or _sensors(document) is not None:
         return True
     if len(data) < 48 or document.is_text:
         return bool(_LINE(document.text))
@@ -134,8 +129,10 @@ def _sensors(document: Document) -> dict[str, Camera] | None:
 
 
 def read_file(document: Document) -> CameraSet:
-    """Read ``cameras.txt`` or ``cameras.bin`` with one camera."""
+    """Read a model, or ``cameras.txt`` or ``cameras.bin`` with one camera."""
     source = document.source
+    if document.is_folder:
+        return _read_folder(source)
     if (stated := _stated_model(document)) is not None:
         camera = Field({**document.tree, "model": stated}, source)
         return CameraSet((_KEYS.camera(camera, "camera1"),), program="COLMAP")
@@ -214,7 +211,7 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
         rows = [(k, [str(word) for word in reader()]) for k in range(1, count + 1)]
         if place != len(data):
             raise ValueError
-    except (struct.error, ValueError) as error:
+    except (struct.error, ValueError, OverflowError) as error:
         if isinstance(error, FormatError):
             raise
         raise FormatError(f"is a damaged {name}.bin of COLMAP; write it again", source) from error

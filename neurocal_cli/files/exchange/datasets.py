@@ -163,8 +163,8 @@ _MVSNET = re.compile(r"\A\s*extrinsic\s+((?:\S+\s+){16})intrinsic\s+((?:\S+\s+){
 def _mvsnet_parts(document: Document) -> Mapping[str, Field]:
     found = _MVSNET(document.text)
     assert found is not None  # `matches`
-    tree = {"extrinsic": found[1].split(), "intrinsic": found[2].split()}
-    return {"camera": Field(tree, document.source)}
+    words = (found[1] + found[2]).split()
+    return {"camera": in_order("extrinsic:16 intrinsic:9", words, document.source)}
 
 
 MVSNET = table(

@@ -30,7 +30,7 @@ from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, plain, plain_lists
-from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector, to_vector
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.format_table import PoseKeys, table
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
@@ -228,12 +228,9 @@ def _parts(document: Document) -> dict[str, Field]:
         R, t = map(keys.find, _PLACED.paths)
         if R is None or t is None:
             raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
-        poses = (
-            (np.eye(3).tolist(), [0.0, 0.0, 0.0]),
-            (matrix_data(R, 9).tolist(), matrix_data(t, 3).tolist()),
-        )
-        for tree, pose in zip(trees, poses, strict=True):
-            tree |= zip(_PLACED.paths, pose, strict=True)
+        trees[0] |= zip(_PLACED.paths, 2 * [[0.0, 0.0, 0.0]], strict=True)
+        pose = matrix_data(R, 9).tolist(), matrix_data(t, 3).tolist()
+        trees[1] |= zip(_PLACED.paths, pose, strict=True)
     if document.is_script:
         document.warnings.append(f"{document.source}: {FROM_ZERO}")
     trees[0] |= {key: root[key].value for key in (_ROWS, *_VECTORS, _VIEWS, _UNIT) if key in root}
@@ -385,9 +382,9 @@ def _holds_camera(tree: Any, depth: int = _DEEPEST) -> bool:
 
 
 def _camera_of(tree: Any) -> dict[str, Any] | None:
-    """All that a camera says; None if it cannot be read."""
+    """All that a camera says but its name; None if it cannot be read."""
     try:
-        return LooseKeys(_within(Field(tree, ""), [])).tree()
+        return {**LooseKeys(_within(Field(tree, ""), [])).tree(), "camera_name": ""}
     except NeurocalError:
         return None
 
@@ -454,6 +451,7 @@ OPENCV = table(
 JSON = replace(
     OPENCV,
     program="JSON",
+    read=Format.read,
     text=lambda cameras, _: {"": json_text(entries(cameras))},
     files="dictionary of the same names",
     skew=True,

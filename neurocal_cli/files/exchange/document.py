@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import io
 import json
+import os
 import re
 import sys
 import zipfile
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError, InputError, one_line
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.mat_file import MARK, lists, read_variables
 from neurocal_cli.files.reading import decode, is_point_table, read_bytes
@@ -75,7 +76,7 @@ class Document:
     ----------
     name : str
         Path, or ``-``.
-    notes, warnings : list of str
+    notes, warnings : list of str, optional
         Remarks about what was read, and doubts about it, are appended.
     distortion : str, optional
         Our name of the distortion model, if the file does not say it.
@@ -86,15 +87,17 @@ class Document:
     def __init__(
         self,
         name: str,
-        notes: list[str],
-        warnings: list[str],
+        notes: list[str] | None = None,
+        warnings: list[str] | None = None,
         distortion: str | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        self.data, self.source = read_bytes(name)
+        self.is_folder = name != "-" and os.path.isdir(name)  # of a model of COLMAP
+        self.data, self.source = (b"", one_line(name)) if self.is_folder else read_bytes(name)
         if self.data.startswith(b"\x1f\x8b"):  # OpenCV's FileStorage packs .yml.gz
             self.data = unpacked(self.data, self.source)
-        self.notes, self.warnings = notes, warnings
+        self.notes = [] if notes is None else notes
+        self.warnings = [] if warnings is None else warnings
         self.distortion, self.size = distortion, size
         self.is_script = False  # of MATLAB or Octave, perhaps
 

@@ -86,17 +86,8 @@ def as_stereo(cameras: CameraSet) -> StereoRig:
             f"the baseline of the rig in {cameras.program}'s file is 0; give the translation between the "
             "cameras, or the files of the single cameras"
         )
-    left, right = (_calibration(cameras, k) for k in range(2))
-    unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
-    return StereoRig(
-        left,
-        right,
-        pose,
-        unknown,
-        np.full((6, 6), np.nan),
-        (),
-        stop_reason=f"from a file of {cameras.program}",
-    )
+    rig = as_rig(cameras)
+    return rig.pair(*rig.cameras)
 
 
 def as_rig(cameras: CameraSet) -> Rig:

@@ -12,7 +12,7 @@ from neurocal_cli.calibration.presented import Converted
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.nearest_camera import with_model
-from neurocal_cli.errors import FormatError, InputError, check_choice, source_of, value_failures
+from neurocal_cli.errors import FormatError, InputError, check_choice, value_failures
 from neurocal_cli.files.exchange import (
     calibrators,
     capture,
@@ -38,12 +38,12 @@ _MODULES = (
     photographs, reconstruction, ros, dictionary,
 )  # fmt: skip
 _ALL = [one for module in _MODULES for one in vars(module).values() if isinstance(one, Format)]
-READ = [one for one in _ALL if one.read is not None]
-FORMATS = {one.to: one for one in _ALL if one.written}  # by the values of the option ``--to``
+READ = [one for one in _ALL if one.is_read]
+FORMATS = {one.to: one for one in _ALL if one.is_written}  # by the values of the option ``--to``
 
 # What is known and cannot be read: how it begins, or how to tell it; what it is, and what to do.
 _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
-    (lambda d: not d.data.strip() and d.source != "<stdin>", "is empty; give a camera file"),
+    (lambda d: not (d.is_folder or d.data.strip() or d.source == "<stdin>"), "is empty; give a camera file"),
     (
         lambda d: "!!python/object" in d.text[:100_000],
         "holds objects of Python, which can run code and are not read; save arrays as lists, array.tolist()",
@@ -208,12 +208,7 @@ def read_cameras(
     names = [str(path) for path in paths]
     if len(names) > 2:
         raise InputError(f"there are {len(names)} files; give one, or the two of one rig")
-    told = [] if notes is None else notes, [] if warnings is None else warnings
-    if any(map(colmap.is_folder, names)):
-        cameras = [colmap.read_folder(name) for name in names if colmap.is_folder(name)]
-        if len(names) == 1:
-            return cameras[0]
-    documents = [Document(name, *told, distortion, size) for name in names]
+    documents = [Document(name, notes, warnings, distortion, size) for name in names]
     if len(documents) == 2 and "-" not in names and (merged := _merged(documents)) is not None:
         documents = [merged]
     cameras = [_read(document) for document in documents]
@@ -227,7 +222,7 @@ def read_intrinsics(
     distortion: str | None = None,
 ) -> Camera:
     """Read a single camera without its poses, from any file of `read_cameras`."""
-    return _single(path, notes, warnings, distortion)[1].cameras[0]
+    return _single(Document(str(path), notes, warnings, distortion)).cameras[0]
 
 
 def read_given_camera(
@@ -237,26 +232,18 @@ def read_given_camera(
     distortion: str | None = None,
 ) -> Camera | Calibration:
     """Read a single camera without its poses; of a neurocal file also the covariance of its parameters."""
-    document, found = _single(path, notes, warnings, distortion)
-    if document is not None and found.program == "neurocal":
+    document = Document(str(path), notes, warnings, distortion)
+    found = _single(document)
+    if found.program == "neurocal":
         return neurocal.without_points(document.root, found)
     return found.cameras[0]
 
 
-def _single(
-    path: str | Path, notes: list[str] | None, warnings: list[str] | None, distortion: str | None
-) -> tuple[Document | None, CameraSet]:
-    name = str(path)
-    if colmap.is_folder(name):
-        document, found = None, colmap.read_folder(name)
-    else:
-        document = Document(
-            name, [] if notes is None else notes, [] if warnings is None else warnings, distortion
-        )
-        found = _read(document, whole=False)
+def _single(document: Document) -> CameraSet:
+    found = _read(document, whole=False)
     if len(found.cameras) > 1:
-        raise FormatError("is a rig; give the file of one camera", source_of(path))
-    return document, found
+        raise FormatError("is a rig; give the file of one camera", document.source)
+    return found
 
 
 def _read(document: Document, whole: bool = True) -> CameraSet:
@@ -264,22 +251,21 @@ def _read(document: Document, whole: bool = True) -> CameraSet:
         for refused, problem in _REFUSED:
             if _is(document, refused):
                 raise InputError(problem)
-        for one in READ:
-            if one.matches is None or one.read is None or not one.matches(document):
-                continue
-            own = not whole and one is neurocal.FORMAT
-            try:
-                found = neurocal.from_tree(document.root, whole) if own else one.read(document)
-            except NoCameraError as error:
-                raise InputError(f"{error}{_nearest(document)}") from error
-            for camera in found.cameras:
-                model = document.distortion
-                if model is not None and with_model(camera.distortion, model) is None:
-                    raise InputError(
-                        f"states its distortion model, {camera.distortion.model}; leave out --distortion"
-                    )
-            return found
-    raise FormatError(UNKNOWN, document.source)
+        one = next((one for one in READ if one.matches(document)), None)
+        if one is None:
+            raise InputError(UNKNOWN)
+        own = not whole and one is neurocal.FORMAT
+        try:
+            found = neurocal.from_tree(document.root, whole) if own else one.read(document)
+        except NoCameraError as error:
+            raise InputError(f"{error}{_nearest(document)}") from error
+        for camera in found.cameras:
+            model = document.distortion
+            if model is not None and with_model(camera.distortion, model) is None:
+                raise InputError(
+                    f"states its distortion model, {camera.distortion.model}; leave out --distortion"
+                )
+        return found
 
 
 def _nearest(document: Document) -> str:

@@ -28,6 +28,7 @@ _METASHAPE = CameraKeys(
     size=("width", "height"),
     skew="b2",
     first_pixel=0.5,
+    from_middle=True,
     optional="any",
     aside=("f", "b1", "skew", "date"),
     complete=True,
@@ -38,12 +39,12 @@ def _metashape_part(tree: Mapping[str, Any], source: str) -> Field:
     root = Field({"projection": "frame", **tree}, source)
     width, height = root["width"].integer(1), root["height"].integer(1)
     f = root["f"].number() if "f" in root else root["fy"].number()
-    middle = (0.5 * width, 0.5 * height) if "f" in root else (0.0, 0.0)  # older versions count from the edge
+    edge = (0.0, 0.0) if "f" in root else (0.5 * width, 0.5 * height)  # older versions count from it
     own = {
         "fx": (root["fx"].number() if "fx" in root else f) + root.get("b1", 0.0).number(),
         "fy": f,
-        "cx": root.get("cx", 0.0).number() + middle[0],
-        "cy": root.get("cy", 0.0).number() + middle[1],
+        "cx": root.get("cx", 0.0).number() - edge[0],
+        "cy": root.get("cy", 0.0).number() - edge[1],
         "b2": root.get("b2", 0.0).number() + root.get("skew", 0.0).number(),
     }
     return Field({**root.value, **own}, source)
@@ -72,15 +73,12 @@ def _metashape_parts(document: Document) -> dict[str, Field]:
 
 
 def _agisoft(tree: Tree) -> str:
-    width, height, f = tree["width"], tree["height"], tree["fy"]
-    kind = tree.pop("projection")
+    kind, f = tree.pop("projection"), tree["fy"]
     entries = {
         "projection": "frame" if kind == "frame" else "equidistant_fisheye",
-        "width": width,
-        "height": height,
+        **{key: tree[key] for key in ("width", "height")},
         "f": f,
-        "cx": tree["cx"] - 0.5 * width,
-        "cy": tree["cy"] - 0.5 * height,
+        **{key: tree[key] for key in ("cx", "cy")},
         "b1": tree["fx"] - f,
         "b2": tree["b2"],
         **{key: tree[key] for key in (*K4, "p1", "p2") if key in tree},
@@ -204,34 +202,19 @@ _OPENSFM = CameraKeys(
     ),
     model="projection_type",
     size=("width", "height"),
+    first_pixel=0.5,
+    from_middle=True,
+    by_longer_side=True,
 )
-
-
 _OLD, _CENTRED = {"projection_type": "perspective"}, {"c_x": 0.0, "c_y": 0.0}
 
 
 def _shots(document: Document) -> dict[str, Field]:
-    root = Field(document.tree, document.source)
     return {
-        name: Field({**_OLD, **({} if "focal_x" in part else _CENTRED), **part}, root.source, name)
+        name: Field({**_OLD, **({} if "focal_x" in part else _CENTRED), **part}, document.source, name)
         for name, part in document.tree.items()
         if isinstance(part, dict) and {"focal", "focal_x"} & set(part) and {"width", "height"} <= set(part)
     }
-
-
-def _opensfm_parts(document: Document) -> dict[str, Field]:
-    parts = {}
-    for name, part in (_shots(document) or {"": Field(document.tree, document.source)}).items():
-        width, height = (part[side].integer(1) for side in ("width", "height"))
-        longer = max(width, height)
-        tree = {
-            key: longer * part[key].number()
-            + {"c_x": 0.5 * (width - 1), "c_y": 0.5 * (height - 1)}.get(key, 0.0)
-            for key in ("focal", "focal_x", "focal_y", "c_x", "c_y")
-            if key in part
-        }
-        parts[name] = Field({**part.value, **tree}, part.source, part.path)
-    return parts
 
 
 OPENSFM = table(
@@ -241,7 +224,7 @@ OPENSFM = table(
         or ({"projection_type", "width", "height"} <= set(document.tree) and "focal" in str(document.tree))
     ),
     "cameras.json, reference of a camera model; also of OpenDroneMap",
-    parts=_opensfm_parts,
+    parts=lambda document: _shots(document) or {"": document.root},
     project=True,
 )
 

@@ -217,7 +217,14 @@ KINECT = table(
 
 # DJI's DewarpData, in the XMP of a photograph or as exiftool prints it: a date; fx, fy, the principal point
 # from the middle of the image, and k1, k2, p1, p2, k3. The size is that of the photograph.
-_DJI = CameraKeys("DJI", ("fx", "fy", "cx", "cy"), (Lens(("",), "plumb_bob", FIVE),), size=("size",))
+_DJI = CameraKeys(
+    "DJI",
+    ("fx", "fy", "cx", "cy"),
+    (Lens(("",), "plumb_bob", FIVE),),
+    size=("size",),
+    first_pixel=0.5,
+    from_middle=True,
+)
 _DEWARP = re.compile(rb"Dewarp ?Data\s*[=:>]\s*[\"']?(?:[-\d]+;)?((?:\s*[-+.\deE]+,){8}\s*[-+.\deE]+)")
 _XMP_BYTES = 300_000  # of a photograph, in which its XMP stands
 
@@ -235,11 +242,8 @@ def _dji_parts(document: Document) -> dict[str, Field]:
         size = header.width, header.height
     if size is None:
         raise InputError("holds the camera of a DJI, from the middle of its images; give --image-size W H")
-    words = found[1].decode().replace(",", " ").split()
-    values = in_order("fx fy cx cy k1 k2 p1 p2 k3", words, document.source).value
-    values["cx"] += 0.5 * (size[0] - 1)
-    values["cy"] += 0.5 * (size[1] - 1)
-    return {"camera": Field({**values, "size": list(size)}, document.source)}
+    words = [*map(str, size), *found[1].decode().replace(",", " ").split()]
+    return {"camera": in_order("size:2 fx fy cx cy k1 k2 p1 p2 k3", words, document.source)}
 
 
 DJI = table(
