@@ -24,7 +24,7 @@ from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rej
 from neurocal_cli.camera.distortion import StraightLines, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
-from neurocal_cli.errors import FormatError, InputError, value_failures
+from neurocal_cli.errors import value_failures
 from neurocal_cli.files.calibration_blocks import (
     VERDICT,
     have_same_std,
@@ -40,6 +40,7 @@ from neurocal_cli.files.key_tables import (
     Keys,
     Kind,
     Stated,
+    check_format,
     column_lines,
     inline,
     named,
@@ -286,9 +287,7 @@ def neurocal_block(root: Field) -> Field:
             root.refuse("is a zoom lens", "give its camera at one setting, from neurocal lens camera")
         root.refuse("has no neurocal block", "give a file that calibrate wrote")
     block = root["neurocal"]
-    form = block["format"].integer()
-    if form not in FORMATS:
-        root.refuse(f"{block.path}.format is {form}, not {' or '.join(map(str, FORMATS))}; update neurocal")
+    check_format(block, *FORMATS)
     return block
 
 
@@ -299,10 +298,8 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     found: dict[str, Stated] = _PARAMETERS.read(parameters)
     std = {name: std for name, (_, std, _) in found.items() if std is not None}
     fixed = frozenset(name for name, (*_, fixed) in found.items() if fixed)
-    try:
+    with value_failures(root.source, f"{parameters.path}: "):
         intrinsics = Intrinsics(*values)
-    except InputError as error:
-        raise FormatError(f"{parameters.path}: {error}; correct it", root.source) from error
     if "camera_matrix" in root:
         K = root["camera_matrix"]["data"].array(9).reshape(3, 3)
         if np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():

@@ -15,6 +15,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -134,6 +135,9 @@ class Header:
     orientation: int = 1  # of EXIF: 1 upright, 2-8 mirrored or rotated
 
 
+Data = bytes | mmap
+
+
 class _TruncatedError(Exception):
     """The file is shorter than its header states."""
 
@@ -161,7 +165,7 @@ def read_header(data: bytes, source: str) -> Header:
             raise FormatError(f"is a {other} file, which is not read; save it as PNG or JPEG", source)
         raise FormatError("is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
     try:
-        header = reader(data)
+        header = reader(data, True)
     except (_TruncatedError, struct.error, IndexError) as error:
         raise FormatError("is cut off in the middle; copy the image again", source) from error
     except ValueError as error:
@@ -182,7 +186,7 @@ def _other(data: bytes) -> str | None:
 
 
 def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
-    """Larger and smaller side [px] of PNG and JPEG files, read from their headers.
+    """Larger and smaller side [px] of images, read from their headers.
 
     The sides are sorted, so the EXIF orientation does not matter. None for stdin, other kinds of files and
     unreadable files: this is only an early check for different cameras, and decoding reports other problems.
@@ -194,35 +198,24 @@ def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
 
 def _stated_size(path: str) -> tuple[int, int] | None:
     try:
-        with open(path, "rb") as file:
-            head = file.read(24)
-            if head.startswith(b"\x89PNG\r\n\x1a\n"):
-                width, height = struct.unpack_from(">II", head, 16)
-                return width, height
-            if not head.startswith(b"\xff\xd8"):
-                return None
-            file.seek(2)
-            while True:
-                mark, kind, length = struct.unpack(">BBH", file.read(4))
-                if mark != 0xFF:
-                    return None
-                if kind in _JPEG_FRAMES:
-                    height, width = struct.unpack(">xHH", file.read(5))
-                    return width, height
-                file.seek(length - 2, 1)
-    except (OSError, ValueError, struct.error):
+        with open(path, "rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+            reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
+            header = None if reader is None else reader(data, False)
+            return None if header is None else (header.width, header.height)
+    except (OSError, ValueError, IndexError, struct.error, _TruncatedError):
         return None
 
 
-def _png(data: bytes) -> Header:
+def _png(data: Data, whole: bool) -> Header:
     chunks: dict[bytes, bytes] = {}
+    bodies = memoryview(data) if isinstance(data, bytes) else data  # not copied
     at, kind = 8, b""
-    while kind != b"IEND":
+    while kind != b"IEND" and (whole or b"IHDR" not in chunks):
         length, kind = struct.unpack_from(">I4s", data, at)
         end = at + 8 + length
         if end + 4 > len(data):
             raise _TruncatedError
-        if zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+        if zlib.crc32(bodies[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             raise ValueError("a checksum is wrong")
         if kind != b"IDAT":
             chunks[kind] = data[at + 8 : end]
@@ -231,10 +224,10 @@ def _png(data: bytes) -> Header:
     return Header("PNG", width, height, _exif_orientation(chunks.get(b"eXIf", b"")))
 
 
-def _jpeg(data: bytes) -> Header:
+def _jpeg(data: Data, whole: bool) -> Header:
     width = height = 0
     orientation, at = 1, 2
-    while True:
+    while whole or not width:
         if data[at] != 0xFF:
             raise ValueError("a marker is missing")
         marker = data[at + 1]
@@ -246,15 +239,16 @@ def _jpeg(data: bytes) -> Header:
         (length,) = struct.unpack_from(">H", data, at + 2)
         if marker in _JPEG_FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 5)
-        elif marker == 0xE1 and data.startswith(_EXIF_MARK, at + 4):
+        elif marker == 0xE1 and data[at + 4 : at + 10] == _EXIF_MARK:
             orientation = _exif_orientation(data[at + 10 : at + 2 + length])
         at += 2 + length
-    if data.rfind(b"\xff\xd9", at) < 0:  # end mark, searched after the header: a thumbnail there has one, too
+    # The end mark is searched after the header: a thumbnail there has one, too.
+    if whole and data.rfind(b"\xff\xd9", at) < 0:
         raise _TruncatedError
     return Header("JPEG", width, height, orientation)
 
 
-def _bmp(data: bytes) -> Header:
+def _bmp(data: Data, whole: bool) -> Header:
     (start, size) = struct.unpack_from("<II", data, 10)
     if size == 12:
         width, height, _, depth = struct.unpack_from("<HHHH", data, 18)
@@ -266,7 +260,7 @@ def _bmp(data: bytes) -> Header:
     return Header("BMP", width, abs(height))
 
 
-def _pnm(data: bytes) -> Header:
+def _pnm(data: Data, whole: bool) -> Header:
     numbers = 2 if data[1:2] in b"14" else 3
     gap = rb"(?:\s|#[^\n\r]*[\n\r])+"
     match = re.match(rb"P[1-6]" + (gap + rb"(\d{1,18})") * numbers + rb"\s", data)
@@ -282,7 +276,7 @@ def _pnm(data: bytes) -> Header:
     return Header("PNM", width, height)
 
 
-def _tiff(data: bytes) -> Header:
+def _tiff(data: Data, whole: bool) -> Header:
     fields = _tiff_fields(data)
     for offsets, lengths in _STRIPS:
         ends = [sum(pair) for pair in zip(fields.get(offsets, ()), fields.get(lengths, ()), strict=False)]
@@ -305,7 +299,7 @@ def _upright(values: tuple[int, ...]) -> int:
     return values[0] if values and 1 <= values[0] <= 8 else 1
 
 
-def _tiff_fields(data: bytes) -> dict[int, tuple[int, ...]]:
+def _tiff_fields(data: Data) -> dict[int, tuple[int, ...]]:
     """Integer fields of the first directory of a TIFF or BigTIFF, by their tags."""
     order = "<" if data[:2] == b"II" else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
@@ -327,7 +321,8 @@ def _tiff_fields(data: bytes) -> dict[int, tuple[int, ...]]:
     return fields
 
 
-_READERS: tuple[tuple[bytes, Callable[[bytes], Header]], ...] = (
+# From the bytes of a file, and whether all of it is checked.
+_READERS: tuple[tuple[bytes, Callable[[Data, bool], Header]], ...] = (
     (rb"\x89PNG\r\n\x1a\n", _png),
     (rb"\xff\xd8\xff", _jpeg),
     (rb"(?:II|MM).?[*+]", _tiff),

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.errors import value_failures
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
     block,
@@ -387,6 +388,16 @@ class Keys:
         return found
 
 
+def check_format(block: Field, *known: int) -> None:
+    """Refuse a block of a format that this version does not know."""
+    form = block["format"].integer()
+    if form not in known:
+        advice = (
+            "update neurocal" if form > max(known) else "write the file again, as older ones are not read"
+        )
+        block.refuse(f"{block.path}.format is {form}, not {' or '.join(map(str, known))}", advice)
+
+
 def _kind(word: str, kinds: Mapping[str, Kind]) -> Kind:
     if re.fullmatch(r"[n\d](?:x[n\d]+)*", word):
         return array(*(-1 if size == "n" else int(size) for size in word.split("x")))
@@ -411,7 +422,11 @@ def record(make: Callable[..., Any], keys: Keys, inline: bool = False) -> Kind:
     def lines(key: str, value: Any, long: bool) -> Iterable[str]:
         return [f"{key}: {keys.flow(value)}"] if inline else block(key, keys.lines(value, long))
 
-    return Kind(lambda field: make(**keys.read(field)), lines)
+    def read(field: Field) -> Any:
+        with value_failures(field.source, f"{field.path}: "):
+            return make(**keys.read(field))
+
+    return Kind(read, lines)
 
 
 _KINDS |= {

@@ -26,7 +26,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
 from neurocal_cli.files.exchange.reading import read_intrinsics
-from neurocal_cli.files.key_tables import Columns, Keys, Kind, inline, record
+from neurocal_cli.files.key_tables import Columns, Keys, Kind, check_format, inline, record
 from neurocal_cli.files.points_csv import POINTS, correspondences, format_points
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.table import Table, parse_table
@@ -152,10 +152,7 @@ _HEAD = Keys(
 
 
 def _lens(block: Field) -> ZoomLens:
-    if block["format"].integer() != _FORMAT:
-        block.refuse(
-            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again"
-        )
+    check_format(block, _FORMAT)
     head = _HEAD.read(block)
     controls, names, model = (head[key] for key in ("controls", "names", "model"))
     if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):

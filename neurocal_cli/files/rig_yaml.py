@@ -22,12 +22,12 @@ from neurocal_cli.calibration.rig.rectification import Rectification, rectify
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import InputError, value_failures
 from neurocal_cli.files.calibration_blocks import POSE_GROUPS, VERDICT
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_from_field, calibration_lines
 from neurocal_cli.files.camera_tree import read_tree
 from neurocal_cli.files.exchange.camera_set import METRES
-from neurocal_cli.files.key_tables import Keys, inline, named, record
+from neurocal_cli.files.key_tables import Keys, check_format, inline, named, record
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import block, boolean, list_lines, text
 
@@ -125,18 +125,15 @@ def stereo_from_field(root: Field) -> StereoRig:
             "program's rig with neurocal convert --to neurocal"
         )
     block = root["stereo"]
-    if block["format"].integer() != STEREO_FORMAT:
-        root.refuse(f"stereo.format is {block['format'].integer()}, not {STEREO_FORMAT}; update neurocal")
+    check_format(block, STEREO_FORMAT)
     left, right = calibration_from_field(root["left"]), calibration_from_field(root["right"])
     if left.unit != right.unit:
         root.refuse("left and right have different units; correct one")
     if (unit := block["unit"].text()) != left.unit:
         root.refuse(f"stereo.unit is {unit}, but left and right are in {left.unit}; correct the one edited")
-    try:
-        pose = Pose(block["R"].array(3, 3), block["t"].array(3))
-    except InputError as error:
-        raise FormatError(f"stereo: {error}; correct it", root.source) from error
     found = _POSE.read(block)
+    with value_failures(root.source, "stereo: "):
+        pose = Pose(found["R"], found["t"])
     stated = {**found["rotation"], **found["translation"]}
     delay = found["delay"] or {"timed": False}
     rig = StereoRig(
@@ -172,7 +169,9 @@ def _check_consistent(rig: StereoRig, block: Field, matrices: Mapping[str, Any],
 
 RIG_FORMAT = 1  # of the block rig; to be raised if older readers cannot read a change
 _STD = record(dict, Keys(", ".join(f"{name}: measure" for name in (*POSE_NAMES, "baseline"))), inline=True)
-_POSES = named(record(dict, Keys("R: 3x3, t: 3, std: std", {"std": _STD}), inline=True))
+_POSES = named(
+    record(lambda R, t, std: (Pose(R, t), std), Keys("R: 3x3, t: 3, std: std", {"std": _STD}), inline=True)
+)
 _EDGE = Keys("cameras: sentences, views: integer, baseline: number, baseline_std: measure")
 _RIG = Keys(
     "unit: text, covariance: square, frames: rows of texts, left_out: reasons, delays?: delays,"
@@ -245,8 +244,7 @@ def rig_from_field(root: Field) -> Rig:
             root["cameras"].fail("two cameras, as there are left and right")
         return of_two(stereo_from_field(root), *names)
     own = root["rig"]
-    if own["format"].integer() != RIG_FORMAT:
-        root.refuse(f"rig.format is {own['format'].integer()}, not {RIG_FORMAT}; update neurocal")
+    check_format(own, RIG_FORMAT)
     cameras = {name: calibration_from_field(one) for name, one in root["cameras"].entries().items()}
     if len(cameras) < 2:
         root["cameras"].fail("two cameras or more")
@@ -255,12 +253,8 @@ def rig_from_field(root: Field) -> Rig:
         root.refuse(
             f"the cameras and rig have different units ({', '.join(sorted(units))}); correct those edited"
         )
-    poses, found = {}, _POSES.read(root["poses"])
-    for name, entry in found.items():
-        try:
-            poses[name] = Pose(entry["R"], entry["t"])
-        except InputError as error:
-            raise FormatError(f"poses.{name}: {error}; correct it", root.source) from error
+    found = _POSES.read(root["poses"])
+    poses, stds = ({name: both[k] for name, both in found.items()} for k in (0, 1))
     if list(poses) != list(cameras):
         root["poses"].fail(f"the poses of {', '.join(cameras)}, in this order")
     if not np.allclose(next(iter(poses.values())).D, np.eye(3, 4), atol=1e-9):
@@ -272,7 +266,6 @@ def rig_from_field(root: Field) -> Rig:
             entry.fail("a list of cameras of this rig and their views, one after the other")
         frames[words[1]] = views
     n = 6 * (len(cameras) - 1)
-    stds = {name: entry["std"] for name, entry in found.items()}
     covariance, timed = rest.pop("covariance").array(n, n, unknown=True), bool(rest.pop("timed"))
     del rest["unit"]
     return Rig(cameras, poses, stds, covariance, frames, timed=timed, **rest)
