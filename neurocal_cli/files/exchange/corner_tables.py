@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,6 +121,16 @@ def _cells(table: Table, ids: list[str], cols: int) -> Array:
     return np.array([places.get(label, (-1, -1)) for label in labels.tolist()], dtype=float)
 
 
+@frozen_dataclass(eq=False)
+class Seen:
+    """The corners of one view: pixels (N, 2), nan if not found, and places (N, 3), if the file has them."""
+
+    name: str
+    pixels: Array
+    places: Array | None
+    field: Field  # for messages
+
+
 def vnl(text: str, source: str, given: Given) -> Correspondences:
     """Read mrcal's table; ``-`` means a corner was not found, and each level doubles sigma."""
     rows: dict[str, list[tuple[float, float, float]]] = {}
@@ -141,44 +151,38 @@ def vnl(text: str, source: str, given: Given) -> Correspondences:
     seen = {name: corners for name, corners in rows.items() if len(corners) > 1 or np.isfinite(corners[0][0])}
     if not seen:
         raise FormatError("has no detected corner; give another file", source)
-    counts = {len(corners) for corners in seen.values()}
-    if len(counts) != 1:
+    if len(set(map(len, seen.values()))) > 1:
         raise FormatError(
             "the images have different numbers of corners; write all of them, - for none", source
         )
-    stack = np.array(list(seen.values()))
-    board = given.board
-    world, ids = of_board(board, counts.pop(), Field(None, source, "the table"), given.advice)
+    stack = np.array(list(seen.values())).reshape(len(seen), -1, 3)
     # A negative level marks a corner that mrcal considers an outlier.
     pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
-    found = np.isfinite(pixels).all(axis=2)
-    points = assembled(world, pixels, _stems(seen), ids, board.unit if board else None, source)
-    sigma = 2.0 ** stack[:, :, 2][found]
+    field, found = Field(None, source, "the table"), np.isfinite(pixels).all(axis=2)
+    views = [Seen(name, uv, None, field) for name, uv in zip(_stems(seen), pixels, strict=True)]
+    points, sigma = assembled(views, given, source), 2.0 ** stack[:, :, 2][found]
     if not (sigma > 1).any():
         return points
     return replace(points, covariance=np.column_stack([sigma**2, 0 * sigma, sigma**2]))
 
 
-def separate(names: list[str], given: Given) -> Correspondences | None:
+def separate(names: list[str], given: Given) -> Correspondences:
     """Read files of numbers: board points X Y Z, unless a board is given, and u v of each view."""
-    tables = [_table(name) for name in names]
-    board, unit = given.board, given.unit
-    if tables[0].shape[1] == 3 or board is None:
+    tables, places = [_table(name) for name in names], None
+    if tables[0].shape[1] == 3 or given.board is None:
         if len(tables) == 1:
             raise FormatError("holds places alone; give the files of the pixels after it", names[0])
-        places, tables, names = tables[0], tables[1:], names[1:]
-        world = np.zeros((1, len(places), 3))
-        world[0, :, : places.shape[1]] = places
-        ids, stated = None, unit
-    else:
-        world, ids = of_board(board, len(tables[0]), Field(None, names[0], "the file"), given.advice)
-        stated = board.unit
+        first, names = tables.pop(0), names[1:]
+        places = np.pad(first, ((0, 0), (0, 3 - first.shape[1])))
+    count = len(tables[0] if places is None else places)
     for name, table in zip(names, tables, strict=True):
-        if table.shape != (world.shape[1], 2):
+        if table.shape != (count, 2):
             raise FormatError(
-                f"has {len(table)} rows of {table.shape[1]}; give {world.shape[1]} rows of u and v", name
+                f"has {len(table)} rows of {table.shape[1]}; give {count} rows of u and v", name
             )
-    return assembled(world, np.stack(tables), _stems(names), ids, stated, names[0])
+    field = Field(None, names[0], "the file")
+    views = [Seen(name, uv, places, field) for name, uv in zip(_stems(names), tables, strict=True)]
+    return assembled(views, given, names[0])
 
 
 def _stems(names: Iterable[str]) -> list[str]:
@@ -208,7 +212,7 @@ def _table(name: str) -> Array:
 def of_board(
     board: Board | None, count: int, field: Field, advice: str, down: bool = False
 ) -> tuple[Array, list[str]]:
-    """Vertices (1, N, 3) of a board of one plane, and their ids, along its rows or down its columns."""
+    """Vertices (N, 3) of a board of one plane, and their ids, along its rows or down its columns."""
     if board is None:
         field.refuse(f"{field.path} has {count} corners a view, but not their places on the board; {advice}")
     if len(board.planes) != 1 or board.planes[0].cols * board.planes[0].rows != count:
@@ -222,24 +226,42 @@ def of_board(
     if down:
         order = order.reshape(plane.rows, plane.cols).T.ravel()
     ids = list(plane.vertex_ids())
-    return plane.vertices().reshape(1, -1, 3)[:, order], [ids[k] for k in order]
+    return plane.vertices().reshape(-1, 3)[order], [ids[k] for k in order]
 
 
 def assembled(
-    world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
+    views: Sequence[Seen],
+    given: Given,
+    source: str,
+    ids: list[str] | None = None,
+    *,
+    unit: str | None = None,
+    named: bool = True,
+    down: bool = False,
 ) -> Correspondences:
-    """Join the views to one data set, without corners that are NaN; `world` is (V, N, 3) or (1, N, 3)."""
-    views, count = pixels.shape[:2]
-    found = np.isfinite(pixels).all(axis=2)
-    if not found.any():
+    """Join views to one data set, without corners that are nan.
+
+    Their ids are these, or those of the board if it has their places, or numbers if corners are `named`.
+    `unit` is that of places in the file, and `down` as for `of_board`.
+    """
+    world, pixels, names, labels = [], [], [], []
+    unit = unit or given.unit or "unknown"
+    for one in views:
+        places, own = one.places, ids or list(map(str, range(len(one.pixels))))
+        if places is None:
+            places, own = of_board(given.board, len(one.pixels), one.field, given.advice, down)
+            unit, named = given.board.unit if given.board else unit, True
+        if len(places) != len(one.pixels):
+            one.field.fail(f"{len(places)} points in each view, as there are places on the board")
+        found = np.asarray(np.isfinite(one.pixels).all(axis=1))
+        world.append(places[found])
+        pixels.append(one.pixels[found])
+        names += [one.name] * int(found.sum())
+        labels += [label for label, here in zip(own, found, strict=True) if here]
+    if not names:
         raise FormatError("has no detected corner; give another file", source)
-    labels = ids if ids is not None else [str(k) for k in range(count)]
     with value_failures(""):
         return Correspondences(
-            np.broadcast_to(world, (views, count, 3))[found],
-            pixels[found],
-            np.repeat(names, count).reshape(views, count)[found],
-            point=np.tile(labels, views).reshape(views, count)[found],
-            unit=unit or "unknown",
-            source=source,
-        )
+            np.concatenate(world), np.concatenate(pixels), np.array(names), unit=unit, source=source,
+            point=np.array(labels) if named else None,
+        )  # fmt: skip

@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError, value_failures
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_names import NAMES, plain
 from neurocal_cli.files.exchange.corner_tables import (
     Given,
+    Seen,
     assembled,
     has_points,
     is_of_cells,
-    of_board,
     of_cells,
     separate,
     table_of,
@@ -112,40 +112,38 @@ def read_corners(
     return None
 
 
-def _corners(
-    root: Field, given: Given, first: float = 0.0, down: bool = False, board: Board | None = None
-) -> Correspondences | None:
+def _corners(root: Field, given: Given, first: float = 0.0, down: bool = False) -> Correspondences | None:
     """Read the points of a dictionary, if it has any; `first` is the coordinate of its first pixel.
 
     Without board points, `down` tells that the corners run along the columns of the board.
     """
     field = root.first(_IMAGE) if isinstance(root.value, dict) else None
-    if field is not None and isinstance(field.value, dict) and "data" not in field:
-        field = None  # by the names of views
-    views_apart = [] if field is not None else _views_apart(root)
-    if field is None and not views_apart:
+    stacked = field is not None and (not isinstance(field.value, dict) or "data" in field)
+    apart = [] if stacked else _views_apart(root)
+    if not stacked and not apart:
         return None
     if isinstance(root.value, dict) and not given.points and LooseKeys(root).has_camera():
         given.notes.append(f"{root.source}: holds points as well as a camera; --what points converts these")
         return None
-    if field is None:
-        return _of_views(root, views_apart, given)
-    board = given.board or board
-    pixels = _stack(field, 2) - first
-    views = len(pixels)
-    names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
-    if "view_names" in root:
-        names = root["view_names"].names(views)
-    places = root.first(_WORLD)
-    world = None if places is None else _stack(places, 3)
-    stated = root["unit"].text() if "unit" in root else given.unit
-    ids = root.read("points", lambda field: field.names(pixels.shape[1]))
-    if world is None:
-        world, ids = of_board(board, pixels.shape[1], field, given.advice, down)
-        stated = board.unit if board else stated
-    if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
-        field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
-    points = assembled(world, pixels, names, ids, stated, root.source)
+    unit, ids = root["unit"].text() if "unit" in root else None, None
+    if stacked:
+        assert field is not None
+        pixels = _stack(field, 2) - first
+        names = [f"{k:0{len(str(len(pixels)))}d}" for k in range(1, len(pixels) + 1)]
+        if "view_names" in root:
+            names = root["view_names"].names(len(pixels))
+        stated = root.first(_WORLD)
+        world: list[Array | None] = [None] * len(pixels) if stated is None else list(_stack(stated, 3))
+        if len(world) not in (1, len(pixels)):
+            field.fail(f"one list of points on the board, or {len(pixels)}")
+        world = world if len(world) > 1 else world * len(pixels)
+        ids = root.read("points", lambda field: field.names(pixels.shape[1]))
+        views = [Seen(*one, field) for one in zip(names, pixels, world, strict=True)]
+    else:
+        views = [_seen(*one) for one in apart]
+        if unit is None and given.unit is None and "locationInObjectSpace" in str(root.value)[:_HEAD]:
+            unit = "m"
+    points = assembled(views, given, root.source, ids, unit=unit, named=stacked, down=down)
     return replace(points, image_size=_size(root, points.pixels))
 
 
@@ -182,33 +180,11 @@ def _views_apart(root: Field) -> list[tuple[str, Field, Field | None]]:
     return found
 
 
-def _of_views(root: Field, views: list[tuple[str, Field, Field | None]], given: Given) -> Correspondences:
-    """Points of views that stand apart, each with its own."""
-    world, pixels, names, ids = [], [], [], []
-    for name, measured, places in views:
-        uv = _listed(measured, "uv", "xy")
-        if places is None:
-            XYZ, own = of_board(given.board, len(uv), measured, given.advice)
-            XYZ = XYZ[0]
-        else:
-            XYZ, own = _listed(places, "XYZ", "xyz"), [str(k) for k in range(len(uv))]
-        if len(XYZ) != len(uv):
-            measured.fail(f"{len(XYZ)} points, as there are places on the board")
-        known = np.isfinite(uv).all(axis=1) & (uv != -1).any(axis=1)  # PhotonVision has -1 without a corner
-        world.append(XYZ[known])
-        pixels.append(uv[known])
-        names += [name] * int(known.sum())
-        ids += [label for label, here in zip(own, known, strict=True) if here]
-    unit = root["unit"].text() if "unit" in root else given.unit
-    if unit is None and "locationInObjectSpace" in str(root.value)[:_HEAD]:
-        unit = "m"
-    labels = None if views[0][2] is not None else ids
-    seen = np.concatenate(pixels)
-    with value_failures(root.source):
-        return Correspondences(
-            np.concatenate(world), seen, np.array(names), _size(root, seen), point=labels,
-            unit=unit or (given.board.unit if given.board and labels else "unknown"), source=root.source,
-        )  # fmt: skip
+def _seen(name: str, measured: Field, places: Field | None) -> Seen:
+    """The corners of a view that stands apart."""
+    pixels = _listed(measured, "uv", "xy")
+    pixels = np.where((pixels == -1).all(axis=1, keepdims=True), np.nan, pixels)  # PhotonVision has no corner
+    return Seen(name, pixels, None if places is None else _listed(places, "XYZ", "xyz"), measured)
 
 
 def _listed(entry: Field, *axes: str) -> Array:
@@ -271,34 +247,26 @@ def _matlab(data: bytes, source: str, given: Given) -> Correspondences | None:
         )
     if stack.ndim == 3:  # M x 2 x P
         root.value[field] = np.moveaxis(stack, 2, 0).tolist()
-    return _corners(root, given, FIRST_PIXEL, down=True, board=_matlab_board(tree, given.unit, source))
+    given = replace(given, board=given.board or _matlab_board(tree, given.unit, source))
+    return _corners(root, given, FIRST_PIXEL, down=True)
 
 
 def _bouguet(tree: dict[str, Any], source: str, given: Given) -> Correspondences | None:
     """Points of Bouguet's toolbox: x_1, X_1, ... of the active images, in pixels from 0."""
     numbers = [int(name[2:]) for name in tree if re.fullmatch(r"x_\d{1,4}", name) and f"X_{name[2:]}" in tree]
     active = np.ravel(tree.get("active_images", np.ones(max(numbers, default=0))))
-    world, pixels, views = [], [], []
+    views = []
     for k in sorted(numbers):
         x, X = (np.asarray(tree[f"{name}_{k}"], dtype=float) for name in "xX")
         if x.ndim != 2 or x.shape[0] != 2 or X.shape != (3, x.shape[1]) or not np.isfinite(x).all():
             continue  # NaN where the image was left out
         if k <= len(active) and active[k - 1]:
-            world.append(X.T)
-            pixels.append(x.T)
-            views += [str(k)] * x.shape[1]
+            views.append(Seen(str(k), x.T, X.T, Field(None, source)))
     if not views:
         return None
     size = tuple(int(np.ravel(tree[name])[0]) for name in ("nx", "ny") if np.size(tree.get(name, ())) == 1)
-    with value_failures(source):
-        return Correspondences(
-            np.concatenate(world),
-            np.concatenate(pixels),
-            np.array(views),
-            (size[0], size[1]) if len(size) == 2 else None,
-            unit=given.unit or "unknown",
-            source=source,
-        )
+    points = assembled(views, given, source, named=False)
+    return replace(points, image_size=(size[0], size[1]) if len(size) == 2 else None)
 
 
 def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board | None:
