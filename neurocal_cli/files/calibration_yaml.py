@@ -35,7 +35,7 @@ from neurocal_cli.files.calibration_blocks import (
     target_lines,
     view_lines,
 )
-from neurocal_cli.files.camera_tree import camera_info_lines, image_size, read_tree
+from neurocal_cli.files.camera_tree import camera_info_lines, read_camera_info, read_tree
 from neurocal_cli.files.key_tables import (
     Keys,
     Kind,
@@ -43,7 +43,6 @@ from neurocal_cli.files.key_tables import (
     check_format,
     column_lines,
     inline,
-    named,
     named_lines,
     not_read,
     read_named,
@@ -105,7 +104,6 @@ FIT = Keys(
     "n_points: integer, n_rejected: integer, rmse_px: measure, max_px: measure",
     n_points=lambda cal: len(cal.points),
 )
-_PARAMETERS = named("stated")
 _AS_IT_IS: Callable[[Field], Any] = lambda field: field  # noqa: E731 - read when the rest is known
 # lens_choice is in px, of data left out; target_stretched is a probability.
 _BLOCK = Keys(
@@ -193,11 +191,10 @@ def read_calibration(path: str | Path) -> Calibration:
 def calibration_from_field(root: Field) -> Calibration:
     """Read a whole calibration from a file, or from the part ``left`` or ``right`` of a rig."""
     block = neurocal_block(root)
-    found = _BLOCK.read(block)
+    found = _BLOCK.read(block) | camera_part(root)
     fit, rejected, center = (found.pop(key) for key in ("fit", "rejected", "image_center"))
-    points = read_observations(
-        found.pop("observations"), found.pop("unit"), image_size(root), center, fit["n_points"] == 0
-    )
+    none, size = fit["n_points"] == 0, found.pop("image_size")
+    points = read_observations(found.pop("observations"), found.pop("unit"), size, center, none)
     if strange := set() if points.view is None else set(points.view_names) - set(found["views"]):
         root.refuse(
             f"{block.path}.observations: the view {min(strange)[:60]!r} is not in {block.path}.views; "
@@ -213,56 +210,74 @@ def calibration_from_field(root: Field) -> Calibration:
         block["fit"]["n_rejected"].fail(f"{len(left_out)}, the number of rows of rejected")
     if found["type"] not in (1, 2, 3, 4):
         block["type"].fail("1, 2, 3 or 4")
-    _, coefficients = distortion_from_field(root)
-    names, covariance = covariance_from_field(block, "covariance")
-    given_names, given_covariance = covariance_from_field(block, "given_covariance")
-    intrinsics, std, fixed = intrinsics_from_field(root)
-    own = {
+    del found["parameters"]
+    return Calibration(points=points, rejected=left_out, **found, **fit)
+
+
+def camera_part(root: Field) -> dict[str, Any]:
+    """The camera of a neurocal file and its accuracy, by the attributes of a calibration, and `image_size`.
+
+    Names of other parameters, values that no covariance has, and values that contradict each other, as one
+    was edited, are errors.
+    """
+    block = neurocal_block(root)
+    camera_name, size, K, coefficients = read_camera_info(root)
+    found = _BLOCK.read(block, "distortion", "parameters", "covariance", "given_covariance")
+    parameters: dict[str, Stated] = found.pop("parameters")
+    model, path = found["distortion_model"], f"{block.path}.parameters"
+    with value_failures(root.source, f"{block.path}.distortion: "):
+        lens = coefficient_names(model)
+    values = [parameters[name][0] if name in parameters else np.nan for name in INTRINSIC_NAMES]
+    if np.isnan(values).any():
+        block["parameters"][INTRINSIC_NAMES[int(np.argmax(np.isnan(values)))]]  # it is missing
+    with value_failures(root.source, f"{path}: "):
+        intrinsics = Intrinsics(*values)
+    if K is not None and np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():
+        root.refuse(f"camera_matrix and {path} disagree; correct the one that was edited")
+    if len(coefficients) < len(lens):
+        root["distortion_coefficients"]["data"].fail(f"{len(lens)} numbers or more")
+    if coefficients[len(lens) :].any():
+        root.refuse(f"distortion_coefficients has more values than {model}, the distortion; correct one")
+    for name, value in zip(lens, coefficients, strict=False):
+        if abs(parameters.get(name, (value,))[0] - value) > _SAME * abs(value):
+            root.refuse(
+                f"distortion_coefficients and {path}.{name} disagree; correct the one that was edited"
+            )
+    std = {name: std for name, (_, std, _) in parameters.items() if std is not None}
+    for key, prefix in (("covariance", "covariance"), ("given_covariance", "given")):
+        names = (found[key] or {"names": ()})["names"]
+        matrix = _covariance(block[key], names, lens) if names else np.zeros((0, 0))
+        found |= {f"{prefix}_names": names, key: matrix}
+        checked = names if key == "covariance" and np.isfinite(matrix).all() else ()
+        for name, variance in zip(checked, np.diagonal(matrix), strict=False):
+            stated = std.get(name, np.nan)
+            if abs(variance - stated**2) > _SAME * stated**2:
+                block.refuse(
+                    f"the std of {name} is {stated:.4g} in {path}, but {math.sqrt(variance):.4g} in "
+                    f"{block.path}.{key}; correct the one that was edited"
+                )
+    return found | {
         "intrinsics": intrinsics,
         "std": std,
-        "fixed": fixed,
-        "points": points,
-        "rejected": left_out,
-        "distortion": coefficients,
-        "covariance": covariance,
-        "covariance_names": names,
-        "given_covariance": given_covariance,
-        "given_names": given_names,
-        "camera_name": root.get("camera_name", "camera").text(),
+        "fixed": frozenset(name for name, (*_, fixed) in parameters.items() if fixed),
+        "distortion": coefficients[: len(lens)],
+        "camera_name": camera_name,
+        "image_size": size,
     }
-    del found["parameters"]
-    return Calibration(**(found | fit | own))
 
 
-def covariance_from_field(block: Field, key: str) -> tuple[tuple[str, ...], Array]:
-    """Read the names and the covariance under a key of the neurocal block; none if it is not there.
-
-    Names of other parameters, values that no covariance has, and standard deviations that differ from those
-    of the parameters are errors.
-    """
-    stated = block.get(key, {"names": []})
-    names = tuple(stated["names"].texts())
-    if not names:
-        return names, np.zeros((0, 0))
-    model = block.get("distortion", "none").text()
-    known = (*INTRINSIC_NAMES, *coefficient_names(model))
+def _covariance(field: Field, names: tuple[str, ...], lens: tuple[str, ...]) -> Array:
+    """Read a covariance of parameters, among them those of a lens."""
+    known = (*INTRINSIC_NAMES, *lens)
     if not set(names) <= set(known) or len(set(names)) < len(names):
-        stated["names"].fail(f"different names among {', '.join(known)}")
-    covariance = stated["data"].array(len(names), len(names), unknown=True)
-    if not np.isfinite(covariance).all():
-        return names, covariance
-    scaled, _ = unit_diagonal(covariance)
-    symmetric = np.abs(scaled - scaled.T).max() < _SAME
-    if not symmetric or np.linalg.eigvalsh(scaled).min() < -_SAME:
-        stated["data"].fail("symmetric, without negative eigenvalues")
-    for name, variance in zip(names, np.diagonal(covariance), strict=True):
-        std = block["parameters"].get(name, {}).get("std").number_or_nan()
-        if key == "covariance" and abs(variance - std**2) > _SAME * std**2:
-            block.refuse(
-                f"the std of {name} is {std:.4g} in {block.path}.parameters, but {math.sqrt(variance):.4g} "
-                f"in {stated.path}; correct the one that was edited"
-            )
-    return names, covariance
+        field["names"].fail(f"different names among {', '.join(known)}")
+    covariance = field["data"].array(len(names), len(names), unknown=True)
+    if np.isfinite(covariance).all():
+        scaled, _ = unit_diagonal(covariance)
+        symmetric = np.abs(scaled - scaled.T).max() < _SAME
+        if not symmetric or np.linalg.eigvalsh(scaled).min() < -_SAME:
+            field["data"].fail("symmetric, without negative eigenvalues")
+    return covariance
 
 
 def neurocal_block(root: Field) -> Field:
@@ -291,52 +306,10 @@ def neurocal_block(root: Field) -> Field:
     return block
 
 
-def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], frozenset[str]]:
-    """Read the intrinsic parameters of a neurocal file, their standard deviations, and the fixed names."""
-    parameters = neurocal_block(root)["parameters"]
-    values = [parameters[name]["value"].number() for name in INTRINSIC_NAMES]
-    found: dict[str, Stated] = _PARAMETERS.read(parameters)
-    std = {name: std for name, (_, std, _) in found.items() if std is not None}
-    fixed = frozenset(name for name, (*_, fixed) in found.items() if fixed)
-    with value_failures(root.source, f"{parameters.path}: "):
-        intrinsics = Intrinsics(*values)
-    if "camera_matrix" in root:
-        K = root["camera_matrix"]["data"].array(9).reshape(3, 3)
-        if np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():
-            root.refuse(f"camera_matrix and {parameters.path} disagree; correct the one that was edited")
-    return intrinsics, std, fixed
-
-
 def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
     """Read the pose of each view of a neurocal calibration; refuse poses in another unit than `unit`."""
     block = neurocal_block(read_tree(path))
-    views, own = read_views(block["views"]), _unit(block)
-    if own != unit:
+    found = _BLOCK.read(block, "unit", "views")
+    if (own := found["unit"]) != unit:
         block.refuse(f"its poses are in {own}, but the points in {unit}; give both in one unit")
-    return {name: view.pose for name, view in views.items()}
-
-
-def _unit(block: Field) -> str:
-    return block.get("unit", "mm").text()
-
-
-def distortion_from_field(root: Field) -> tuple[str, Array]:
-    """Read the distortion model of a neurocal file, by our name, and its coefficients."""
-    block = neurocal_block(root)
-    model = block.get("distortion", "none").text()
-    with value_failures(root.source, f"{block.path}.distortion: "):
-        names = coefficient_names(model)
-    data = root["distortion_coefficients"]["data"]
-    coefficients = data.array(-1)
-    if len(coefficients) < len(names):
-        data.fail(f"{len(names)} numbers or more")
-    if coefficients[len(names) :].any():
-        root.refuse(f"distortion_coefficients has more values than {model}, the distortion; correct one")
-    for name, value in zip(names, coefficients, strict=False):
-        stated = block["parameters"].get(name, {}).get("value", value).number()
-        if abs(stated - value) > _SAME * abs(value):
-            root.refuse(
-                f"distortion_coefficients and {block.path}.parameters.{name} disagree; correct the one that "
-                "was edited"
-            )
-    return model, coefficients[: len(names)]
+    return {name: view.pose for name, view in found["views"].items()}

@@ -22,6 +22,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import checked_size
 from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.errors import FormatError, InputError, value_failures
+from neurocal_cli.files.key_tables import Keys, inline, not_read
 from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
@@ -192,17 +193,6 @@ _FORMULAS = {
 }
 
 
-def image_size(root: Field) -> tuple[int, int] | None:
-    """Width and height [px]; None if they are unknown, or 0."""
-    if "image_width" not in root or "image_height" not in root:
-        return None
-    size = root["image_width"].integer(), root["image_height"].integer()
-    if 0 in size:
-        return None
-    with value_failures(root.source):
-        return checked_size(size)
-
-
 def matrix_data(field: Field, length: int) -> Array:
     """Read matrices in row order: rows, cols and data, or lists of any depth; any `length` if it is -1."""
     if isinstance(field.value, dict) and "rows" not in field and "data" in field:
@@ -259,19 +249,40 @@ def _unpacked(field: Field) -> list[float]:
         field.fail("numbers, or OpenCV's base64 of them")
 
 
+def _matrix(matrix: Array) -> str:
+    rows, cols = matrix.shape
+    return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))
+
+
+_INFO = Keys(
+    "camera_name!: name, image_width!: integer, image_height!: integer, camera_matrix!: square,"
+    "distortion_model: model, distortion_coefficients: matrix, rectification_matrix: shown,"
+    "projection_matrix: shown",
+    {
+        "name": inline(Field.text, text, "camera"),
+        "square": inline(lambda field: field["data"].array(9).reshape(3, 3), _matrix),
+        "model": inline(not_read, text),
+        "matrix": inline(lambda field: field["data"].array(-1), _matrix),
+        "shown": inline(not_read, _matrix),
+    },
+)
+
+
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
     """Lines of a camera_info; `rectified` are R (3, 3) and P (3, 4) on a rig, as ROS defines them."""
     R, P = rectified or (np.eye(3), np.column_stack([camera.A, np.zeros(3)]))
     width, height = camera.image_size or (0, 0)  # ROS's readers require numbers
     model, coefficients = to_ros(camera.distortion.model, camera.distortion.coefficients)
-    yield f"camera_name: {text(camera.name)}"
-    yield f"image_width: {width}"
-    yield f"image_height: {height}"
-    yield f"camera_matrix: {_matrix(camera.A)}"
-    yield f"distortion_model: {model}"
-    yield f"distortion_coefficients: {_matrix(coefficients[None])}"
-    yield f"rectification_matrix: {_matrix(R)}"
-    yield f"projection_matrix: {_matrix(P)}"
+    values = camera.name, width, height, camera.A, model, coefficients[None], R, P
+    return _INFO.lines(dict(zip(_INFO.names, values, strict=True)))
+
+
+def read_camera_info(root: Field) -> tuple[str, tuple[int, int] | None, Array | None, Array]:
+    """Name, image size, matrix and coefficients of a camera_info that neurocal wrote."""
+    name, width, height, K, coefficients = _INFO.read(root).values()
+    with value_failures(root.source):
+        size = checked_size((width, height)) if width and height else None
+    return name, size, K, coefficients
 
 
 def format_camera_info(camera: Camera, rectified: tuple[Array, Array] | None = None) -> str:
@@ -293,8 +304,3 @@ def format_panorama(panorama: Panorama) -> str:
         f"v0: {number(panorama.v0)}",
     ]
     return "\n".join([*lines, ""])
-
-
-def _matrix(matrix: Array) -> str:
-    rows, cols = matrix.shape
-    return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))

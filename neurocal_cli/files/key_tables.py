@@ -378,11 +378,11 @@ class Keys:
         """The block as a mapping on one line."""
         return f"{{{', '.join(self.lines(value))}}}"
 
-    def read(self, field: Field) -> dict[str, Any]:
-        """The values of the block by their attributes."""
+    def read(self, field: Field, *only: str) -> dict[str, Any]:
+        """The values of the block by their attributes, or `only` those of some keys."""
         found = {}
         for name, attribute, optional, kind in self.keys:
-            if kind.read is not not_read:
+            if kind.read is not not_read and (not only or name in only):
                 value = field.read(name, kind.read) if optional else kind.read(field[name])
                 found[attribute] = kind.empty if value is None else value
         return found

@@ -14,13 +14,10 @@ from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.errors import InputError, value_failures
 from neurocal_cli.files.calibration_yaml import (
     calibration_from_field,
-    covariance_from_field,
-    distortion_from_field,
+    camera_part,
     format_calibration,
-    intrinsics_from_field,
     neurocal_block,
 )
-from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.rig_yaml import format_rig, format_stereo_rig, rig_from_field, stereo_from_field
@@ -42,9 +39,9 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
             return camera_set(rig_from_field(root))
         return camera_set(stereo_from_field(root))
     if not whole:
-        intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)
-        name = root.get("camera_name", "camera").text()
-        camera = Camera(intrinsics, Distortion(model, k), image_size(root), name)
+        own = camera_part(root)
+        lens = Distortion(own["distortion_model"], own["distortion"])
+        camera = Camera(own["intrinsics"], lens, own["image_size"], own["camera_name"])
         return CameraSet((camera,), program="neurocal")
     return camera_set(calibration_from_field(root))
 
@@ -52,8 +49,10 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
 def without_points(root: Field, camera: CameraSet) -> Calibration:
     """A calibration without its poses and points, from its file and the camera in it."""
     block = neurocal_block(root)
-    own = covariance_from_field(block, "covariance")
-    names, covariance = own if own[0] else covariance_from_field(block, "given_covariance")
+    own = camera_part(root)
+    names, covariance = own["covariance_names"], own["covariance"]
+    if not names:
+        names, covariance = own["given_names"], own["given_covariance"]
     undistorted = block["observations"].get("undistorted", "").text() if "observations" in block else ""
     with value_failures(root.source):
         points = Correspondences.none(camera.cameras[0].image_size, _UNKNOWN, undistorted)
