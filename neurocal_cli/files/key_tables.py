@@ -119,23 +119,33 @@ class Columns:
         yield "rows:"
         yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
 
+    def listed(self, columns: Field) -> list[str]:
+        """The names of columns, those of the table and with all that it needs."""
+        names = columns.texts()
+        every = [name for _, group, _, _ in self.groups for name in group]
+        needed = [name for _, group, optional, _ in self.groups if not optional for name in group]
+        if len(set(names)) < len(names) or not set(needed) <= set(names):
+            columns.fail(f"a list of different names with {', '.join(needed)} among them")
+        if strange := sorted(set(names) - set(every)):
+            columns.fail(f"names among {', '.join(every)}, and not {strange[0][:40]!r}")
+        return names
+
     def read(self, field: Field) -> dict[str, Any] | None:
         """The values of the attributes in either form of a table; None if it has no rows."""
-        if isinstance(field["columns"].value, dict):
-            table = read_columns(field["columns"], self.labels)
-        else:
-            names = field["columns"].texts()
-            rows = [row.value for row in field["rows"].items()]
-            if len(set(names)) < len(names) or any(
-                type(row) is not list or len(row) != len(names) for row in rows
-            ):
-                field.fail(f"a table with {len(names)} columns")
-            table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
-        needed = [name for _, names, optional, _ in self.groups if not optional for name in names]
-        known = {name for _, names, _, _ in self.groups for name in names}
-        if table and not set(needed) <= set(table) <= known:
-            field.fail(f"a table with {', '.join(needed)}")
-        return self.values(table, field) if table else None
+        columns, rows = field["columns"], field.get("rows")
+        if isinstance(columns.value, dict):
+            table = read_columns(columns, self.labels)
+            self.listed(Field(list(table), columns.source, columns.path))
+            return self.values(table, field)
+        names = self.listed(columns) if columns.value or rows.value else []
+        if not isinstance(rows.value, list):
+            rows.fail("a list of rows")
+        for k, row in enumerate(rows.value):
+            if type(row) is not list or len(row) != len(names):
+                Field(row, rows.source, f"{rows.path}[{k}]").fail(f"a list of {len(names)} values")
+        if not rows.value:
+            return None
+        return self.values(dict(zip(names, map(list, zip(*rows.value, strict=True)), strict=True)), rows)
 
     def values(self, table: Mapping[str, list[Any]], field: Field) -> dict[str, Any]:
         """The values of the attributes, from columns by their names; None for those that are not there."""

@@ -130,17 +130,18 @@ def read_observations(
 ) -> Correspondences:
     """Read the block ``observations`` in either form; it may be empty if `none`."""
     if "places" in observations:
-        columns, stands = _long_columns(observations), f"{observations.path}.views"
+        columns = _long_columns(observations)
+        found = _COLUMNS.values(columns, observations["views"]) if columns else None
     else:
-        columns, stands = _row_columns(observations), f"{observations.path}.rows"
-    if none and not columns:  # a camera from a zoom lens
+        found = _COLUMNS.read(observations)
+    if none and not found:  # a camera from a zoom lens
         return Correspondences.none(image_size, unit)
-    if not columns:
+    if not found:
         observations["rows"].fail("at least one row")
 
     with value_failures(""):
         return Correspondences(
-            **_COLUMNS.values(columns, Field(None, observations.source, stands)),
+            **found,
             **_HEAD.read(observations),
             image_size=image_size,
             image_center=image_center,
@@ -149,28 +150,8 @@ def read_observations(
         )
 
 
-def _names(observations: Field) -> list[str]:
-    names = observations["columns"].texts()
-    missing = [name for name in (*PLACE, *PIXEL) if name not in names]
-    if missing or len(set(names)) < len(names):
-        observations["columns"].fail("a list of different names with X, Y, Z, u, v among them")
-    return names
-
-
-def _row_columns(observations: Field) -> dict[str, list[Any]]:
-    """Turn the table into columns by name."""
-    names = _names(observations)
-    rows = observations["rows"]
-    if not isinstance(rows.value, list):
-        rows.fail("a list of rows")
-    for k, row in enumerate(rows.value):
-        if type(row) is not list or len(row) != len(names):
-            Field(row, rows.source, f"{rows.path}[{k}]").fail(f"a list of {len(names)} values")
-    return dict(zip(names, map(list, zip(*rows.value, strict=True)), strict=True)) if rows.value else {}
-
-
 def _long_columns(observations: Field) -> dict[str, list[Any]]:
-    names = _names(observations)
+    names = _COLUMNS.listed(observations["columns"])
     places = read_columns(observations["places"], frozenset(("point",)))
     measured = [name for name in names if name not in places and name != "view"]
     packed = "numbers" in observations

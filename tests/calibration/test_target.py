@@ -62,7 +62,7 @@ def test_files_keep_the_target_to_the_last_bit(tmp_path: Path) -> None:
 def test_a_damaged_target_is_refused(tmp_path: Path) -> None:
     text = format_calibration(bent()).replace("X_given", "X_taken")
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
-    with pytest.raises(FormatError, match="a table with plane"):
+    with pytest.raises(FormatError, match="columns must be a list of different names with plane"):
         read_calibration(tmp_path / "c.yaml")
 
 

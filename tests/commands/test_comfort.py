@@ -77,11 +77,12 @@ def test_the_size_that_an_image_shows_is_counted_from_its_points(kind: Points) -
 
 
 def test_images_of_different_sizes_are_named_before_the_work(tmp_path: Path) -> None:
-    for name, size in (("a.png", (30, 40)), ("b.jpg", (40, 30)), ("c.jpg", (60, 80)), ("d.png", (60, 80))):
+    for name, size in (("a.png", (30, 40)), ("b.jpg", (40, 30)), ("c.jpg", (60, 80)), ("d.tif", (60, 80))):
         cv2.imwrite(str(tmp_path / name), np.zeros(size, np.uint8))
-    (tmp_path / "e.png").write_bytes(b"\x89PNG")
+    for name, data in (("e.png", b"\x89PNG"), ("f.png", b"")):
+        (tmp_path / name).write_bytes(data)
     found = list(stated_sizes([*map(str, sorted(tmp_path.iterdir())), "-", "none.png"]))
-    assert found == [(40, 30), (40, 30), (80, 60), (80, 60), None, None, None]
+    assert found == [(40, 30), (40, 30), (80, 60), (80, 60), None, None, None, None]
     result = run("detect", tmp_path, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
     assert result.stderr.startswith("note: the images have 2 sizes (2 of 40 x 30 px, 2 of 80 x 60 px)")
 

@@ -364,6 +364,11 @@ FAULTS = [
         ": neurocal.observations.columns must be a list of different names",
     ),
     (
+        r"columns: \[view,",
+        "columns: [vieuw,",
+        ": neurocal.observations.columns must be names among view, point, X, Y, Z",
+    ),
+    (
         r'\["view00", 0.0, ',
         '["view00", "zero", ',
         ": neurocal.observations.rows, column X, must be n finite numbers",
