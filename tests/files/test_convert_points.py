@@ -182,7 +182,7 @@ REFUSED = {
     '{"corners": [[[1, 2], [3, 4]]]}': "corners has 2 corners a view, but not their places on the board",
     '{"corners": [[[1, 2], [3, 4]], [[1, 2]]]}': "corners must be the same number of points in each view",
     '{"corners": [[[1, 2]]], "objpoints": [[1, 2, 3], [4, 5, 6]]}': "corners must be 2 points in each view",
-    '{"corners": [[[1, 2]]], "objpoints": [[1, 2, 3]], "points": ["a", "b"]}': "points must be 1 different names",
+    '{"corners": [[[1, 2]]], "objpoints": [[1, 2, 3]], "points": ["a", "b"]}': "points must be 1 diff",
     '{"corners": [[["a", 2]]]}': "corners must be the same number",
     "1 2 3\n": "/file: holds places alone",
     "1 2 3\n1 2\n": ":2: must be a row of 2 numbers or of 3",
