@@ -164,6 +164,11 @@ class Pose:
         """Pose from Euler angles [rad] and a translation."""
         return cls(euler_to_rotation(R_x, R_y, R_z), t)
 
+    def relative_to(self, other: Pose) -> Pose:
+        """The pose of this camera in the frame of another one: ``X_self = R X_other + t``."""
+        R = self.R @ other.R.T
+        return Pose.exact(R, self.t - R @ other.t)
+
     def to_camera(self, world: Array) -> Array:
         """World points (..., 3) in the camera's frame."""
         return np.asarray(world @ self.R.T + self.t)

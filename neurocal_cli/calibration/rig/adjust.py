@@ -25,6 +25,7 @@ from neurocal_cli.adjustment.reprojection import (
 from neurocal_cli.adjustment.views import Views, batches_of
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.calibration.rig.frames import frames_of_pairs
 from neurocal_cli.calibration.rig.problem import (
     Frames,
     Observations,
@@ -85,13 +86,8 @@ def rig_problem(calibrations: Sequence[Calibration], frames: Frames) -> RigProbl
 
 def stereo_problem(left: Calibration, right: Calibration, pairs: Sequence[tuple[str, str]]) -> RigProblem:
     """Combine two calibrations, of which some views are paired by their names."""
-    place = {name: k for k, name in enumerate(left.points.view_names)}
-    partner = {b: place[a] for a, b in pairs}
-    frame, end = [], len(place)
-    for name in right.points.view_names:
-        frame.append(partner.get(name, end))
-        end += name not in partner
-    return rig_problem((left, right), (np.arange(len(place)), np.array(frame)))
+    frames = frames_of_pairs(left.points.view_names, right.points.view_names, pairs)
+    return rig_problem((left, right), frames.of_views)
 
 
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:

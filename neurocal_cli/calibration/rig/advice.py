@@ -15,14 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target
-from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.space_uncertainty import fitted, shared_covariance
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, pixel_moves, shared_covariance
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, median
-from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 
 _MOST = 0.5  # least share of the target's points that the second camera has to see
@@ -88,75 +85,29 @@ def _gain(covariance: Array, information: Array) -> Array:
     return np.asarray(information @ np.linalg.inv(np.eye(len(covariance)) + covariance @ information))
 
 
-@frozen_dataclass(eq=False)
-class _Side:
-    """One of two cameras."""
-
-    calibration: Calibration
-    camera: Camera
-    pose: Pose  # X_c = R X_rig + t
-    lens: NDArray[np.intp]  # columns of A's entries and the coefficients among the shared unknowns
-    mounted: NDArray[np.intp]  # (6,) or, for the first camera of the rig, (0,) columns of its pose
-    pixel_scale: float
-    sigma: float  # noise [px]
-    square: bool
-
-    def shown(self, in_rig: Array) -> NDArray[np.bool_]:
-        """(N,) which points (N, 3) in the rig are in the image."""
-        camera, points = self.camera, self.pose.to_camera(in_rig)
-        assert camera.image_size is not None
-        pixels, fine = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels >= 0) & (pixels <= np.array(camera.image_size) - 1)).all(axis=1)
-        return np.asarray(inside & fine & camera.sees(points))
-
-    def derivatives(self, in_rig: Array, unit: float) -> tuple[Array, Array]:
-        """Of pixels over their noise, by the camera (2 N, k) and by a motion of the target (2 N, 6)."""
-        by_lens, by_point = self.camera.project_jacobian(self.pose.to_camera(in_rig))
-        if self.square:
-            by_lens[:, :, 0] += by_lens[:, :, 2]
-        by_lens[:, :, :5] *= self.pixel_scale
-        by_target = by_point @ self.pose.R @ _moved(in_rig, 1.0)
-        parts = [by_lens]
-        if len(self.mounted):
-            parts.append(by_point @ _moved(in_rig @ self.pose.R.T, unit))
-        own = np.concatenate(parts, axis=2)
-        return own.reshape(-1, own.shape[2]) / self.sigma, by_target.reshape(-1, 6) / self.sigma
-
-
 class _Pair:
     """Two cameras of a rig, by their index."""
 
     def __init__(self, rig: Rig, fit: RigFit, first: int, second: int) -> None:
         state, problem, columns = fit.state, fit.problem, fit.state.columns
-        cameras = list(rig.cameras.values())
-        self.indices, self.unit, self.variance = (first, second), problem.unit, fit.variance
-        self.sides = [
-            _Side(
-                cameras[side],
-                cameras[side].camera,
-                list(rig.poses.values())[side],
-                columns.cameras[side],
-                columns.rigs[side],
-                problem.observations[side].pixel_scale,
-                problem.observations[side].pixel_scale / float(np.sqrt(problem.observations[side].weight)),
-                state.cameras[side].square,
-            )
-            for side in self.indices
-        ]
-        self.columns = np.concatenate([part for side in self.sides for part in (side.lens, side.mounted)])
-        self.world = points_of_target(self.sides[0].calibration)
+        self.fit, self.indices = fit, (first, second)
+        self.cameras = [list(rig.cameras.values())[side] for side in self.indices]
+        self.poses = [list(rig.poses.values())[side] for side in self.indices]
+        self.columns = np.concatenate(
+            [part for side in self.indices for part in (columns.cameras[side], columns.rigs[side])]
+        )
+        self.world = points_of_target(self.cameras[0])
         seen = np.zeros(len(problem.scale), dtype=bool)
         for side in self.indices:
             seen[problem.observations[side].view] = True
         middles = (state.view_t * problem.scale[:, None])[seen & problem.together]
         self.middle = np.array([median(column) for column in middles.T])  # of the boards, in the rig
-        self.distance = float(np.linalg.norm(self.sides[1].pose.to_camera(self.middle[None])))
+        self.distance = float(np.linalg.norm(self.poses[1].to_camera(self.middle[None])))
 
     @cached_property
     def views(self) -> list[Candidate]:
         """Views of the target by the first camera that the second one sees, too."""
-        return [view for view in candidates(self.sides[0].calibration) if self._is_seen(view)]
+        return [view for view in candidates(self.cameras[0]) if self._is_seen(view)]
 
     def share(self, covariance: Array) -> float:
         """The standard deviation over the distance of the boards, by the covariance of all unknowns."""
@@ -164,22 +115,13 @@ class _Pair:
 
     def std(self, own: Array) -> float:
         """Largest std of where the second camera sees what the first one sees, by their own covariance."""
-        first, second = self.sides
-        R = second.pose.R @ first.pose.R.T
-        J = _moved(self.middle[None] @ second.pose.R.T, self.unit)[0]  # by a motion of the second camera
-        parts = [
-            np.zeros((3, len(first.lens))),
-            -J @ np.kron(np.eye(2), R),
-            np.zeros((3, len(second.lens))),
-            J,
-        ]
-        kept = [
-            parts[0],
-            *parts[1:2] * bool(len(first.mounted)),
-            parts[2],
-            *parts[3:] * bool(len(second.mounted)),
-        ]
-        by_own = np.concatenate(kept, axis=1)
+        (first, second), rigs = self.poses, self.fit.state.columns.rigs
+        R, whole = second.R @ first.R.T, np.zeros((3, self.fit.state.columns.n_shared))
+        J = _moved(self.middle[None] @ second.R.T, self.fit.problem.unit)[0]
+        for side, by_motion in zip(self.indices, (-J @ np.kron(np.eye(2), R), J), strict=True):
+            if side:
+                whole[:, rigs[side]] = by_motion
+        by_own = whole[:, self.columns]
         return float(np.sqrt(max(np.linalg.eigvalsh(by_own @ own @ by_own.T)[-1], 0.0)))
 
     @cached_property
@@ -188,29 +130,38 @@ class _Pair:
         return [self._information(view) for view in self.views]
 
     def _information(self, view: Candidate) -> Array:
-        in_rig, by_own, by_target = self._in_rig(view), [], []
-        for side in self.sides:
-            own, target = side.derivatives(in_rig[side.shown(in_rig)], self.unit)
-            by_own.append(own)
-            by_target.append(target)
-        (a, b), P = by_own, np.concatenate(by_target)
-        J = np.block([[a, np.zeros((len(a), b.shape[1]))], [np.zeros((len(b), a.shape[1])), b]])
+        in_rig, rows = self._in_rig(view), []
+        for which, side in enumerate(self.indices):
+            points, observed = in_rig[self._shown(which, in_rig)], self.fit.problem.observations[side]
+            by_point, by_shared = pixel_moves(self.fit, points, side)
+            both = np.concatenate([by_shared[:, :, self.columns], by_point @ _moved(points, 1.0)], axis=2)
+            rows.append(both.reshape(-1, both.shape[2]) * (np.sqrt(observed.weight) / observed.pixel_scale))
+        J, P = np.split(np.concatenate(rows), [len(self.columns)], axis=1)
         C = J.T @ P
-        return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T) / self.variance
+        return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T) / self.fit.variance
 
     def _in_rig(self, view: Candidate) -> Array:
-        pose = self.sides[0].pose
+        pose = self.poses[0]
         return np.asarray((view.pose.to_camera(self.world) - pose.t) @ pose.R)
+
+    def _shown(self, which: int, in_rig: Array) -> NDArray[np.bool_]:
+        """(N,) which points (N, 3) in the rig are in the image of the first or the second camera."""
+        camera, points = self.cameras[which].camera, self.poses[which].to_camera(in_rig)
+        assert camera.image_size is not None
+        pixels, fine = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels <= np.array(camera.image_size) - 1)).all(axis=1)
+        return np.asarray(inside & fine & camera.sees(points))
 
     def _is_seen(self, view: Candidate) -> bool:
         in_rig = self._in_rig(view)
-        if self.sides[1].shown(in_rig).mean() < _MOST:
+        if self._shown(1, in_rig).mean() < _MOST:
             return False
         _, size, axes = np.linalg.svd(in_rig - in_rig.mean(axis=0), full_matrices=False)
         if size[2] > _FLAT * size[0]:
             return True
         # Both cameras have to be on the side of a flat target that the first one sees.
-        lines = [in_rig.mean(axis=0) + side.pose.R.T @ side.pose.t for side in self.sides]
+        lines = [in_rig.mean(axis=0) + pose.R.T @ pose.t for pose in self.poses]
         first, second = (float(axes[2] @ line) / float(np.linalg.norm(line)) for line in lines)
         return first * second > 0 and abs(second) > _FACING
 

@@ -15,10 +15,10 @@ from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.arranged_boards import arranged
 from neurocal_cli.calibration.calibrate import CameraOptions, calibrate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig, rig_problem
 from neurocal_cli.calibration.rig.assessment import told_once
 from neurocal_cli.calibration.rig.fit import fit_rig
-from neurocal_cli.calibration.rig.frames import ViewPairs, connected_frames
+from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.target_choice import can_tell, common_target, on_one_target
 from neurocal_cli.camera.directions import WIDE
@@ -351,13 +351,21 @@ def _swapped(rig: StereoRig) -> tuple[str, ...]:
     )
 
 
-def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: ViewPairs) -> dict[str, Pose]:
-    """Poses of views in the left camera's frame that fit both cameras of a known rig best, by its names.
+def poses_on_rig(
+    rig: Mapping[str, Pose], cameras: Mapping[str, Calibration], frames: FrameNames
+) -> dict[str, Pose]:
+    """Poses of the frames of several cameras that fit all of them best, by the names of the frames.
 
-    The cameras have the poses of the views in each camera alone.
+    `rig` are the poses of the cameras in a frame of reference, in which those of the frames are. The
+    calibrations have the poses of the views in each camera alone.
     """
-    problem = stereo_problem(*cameras, views.both)
-    start = problem.start([rig])
+    base, *others = (rig[name] for name in cameras)
+    problem = rig_problem(list(cameras.values()), frames.of_views)
+    start = problem.start([pose.relative_to(base) for pose in others])
     state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
-    R, t = problem.world_poses(state, side=0)
-    return {name: Pose(R[k], t[k]) for k, name in enumerate(problem.names[0])}
+    found = {}
+    for k in np.flatnonzero(problem.together):
+        R = state.view_R[k]
+        t = state.view_t[k] * problem.scale[k] - R @ problem.centre[k]
+        found[frames.names[k]] = Pose.exact(base.R.T @ R, base.R.T @ (t - base.t))
+    return found

@@ -30,8 +30,8 @@ from neurocal_cli.calibration.evaluation import (
 )
 from neurocal_cli.calibration.rig.assessment import assess_stereo
 from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo, poses_on_rig
-from neurocal_cli.calibration.rig.frames import Pairs, ViewPairs, pair_points, pair_views
-from neurocal_cli.calibration.rig.rig import StereoRig
+from neurocal_cli.calibration.rig.frames import Pairs, frames_of_pairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.rig import StereoRig, of_two
 from neurocal_cli.calibration.rig.triangulation import Method, triangulate
 from neurocal_cli.calibration.target_choice import on_one_target
 from neurocal_cli.calibration.verdict.findings import Finding
@@ -277,7 +277,10 @@ class _Evaluator:
             # The pose of each view in the left camera that fits both cameras best.
             own = {name: view.pose for name, view in rig.left.views.items()}
             if self.fitted is not None:
-                own.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
+                fits = dict(zip(("left", "right"), self.fitted, strict=True))
+                one, other = (fit.points.view_names for fit in self.fitted)
+                frames = frames_of_pairs(one, other, self.new)
+                own.update(poses_on_rig(of_two(rig).poses, fits, frames))
             poses = [own[a] for a, _ in pairs]
             used = np.array([pair not in rig.left_out for pair in pairs])
             # None if all views contradict the rig.
@@ -331,9 +334,8 @@ class _Evaluator:
         for pair in pairs:
             source = self.fitted if self.fitted is not None and pair in new else self.cameras
             left, right = (source[side].views[pair[side]].pose for side in (0, 1))
-            R = right.R @ left.R.T
             first.append(left)
-            rigs.append(Pose.exact(R, right.t - R @ left.t))
+            rigs.append(right.relative_to(left))
         return first, rigs
 
     def _judged(self, rig: StereoRig, poses: list[Pose]) -> Verdict | None:

@@ -262,12 +262,18 @@ def connected_frames(points: Mapping[str, Correspondences]) -> FrameNames:
         check_one_target(points)
     else:
         pair_points(left, right, pairs)
-    partner = {b: a for a, b in pairs.both}
-    place = {name: k for k, name in enumerate(left.view_names)}
-    others = {name: len(place) + k for k, name in enumerate(pairs.right_only)}
-    of_right = [place[partner[name]] if name in partner else others[name] for name in right.view_names]
-    names = (*left.view_names, *pairs.right_only)
-    return FrameNames(names, (np.arange(len(place)), np.array(of_right, dtype=np.intp)))
+    return frames_of_pairs(left.view_names, right.view_names, pairs.both)
+
+
+def frames_of_pairs(
+    left: Sequence[str], right: Sequence[str], pairs: Sequence[tuple[str, str]]
+) -> FrameNames:
+    """The frames of the views of two cameras, of which some are paired."""
+    partner = {b: a for a, b in pairs}
+    names = (*left, *(name for name in right if name not in partner))
+    place = {name: k for k, name in enumerate(names[len(left) :], len(left))}
+    place |= {b: left.index(a) for b, a in partner.items()}
+    return FrameNames(names, (np.arange(len(left)), np.array([place[name] for name in right], dtype=np.intp)))
 
 
 def _of_other_planes(left: Correspondences, right: Correspondences, pairs: ViewPairs) -> bool:

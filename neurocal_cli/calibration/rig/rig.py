@@ -293,17 +293,14 @@ class Rig(FixedCameras):
                 raise InputError(f"the rig has no camera {name!r}; give two of {', '.join(self.cameras)}")
         if left == right:
             raise InputError(f"{left!r} is given twice; give two cameras")
-        a, b = self.poses[left], self.poses[right]
-        R = b.R @ a.R.T
-        t = b.t - R @ a.t
-        pose = Pose(R, t)
         if left == self.first:
             at = 6 * (list(self.poses).index(right) - 1)
             covariance, std = self.covariance[at : at + 6, at : at + 6], self.std[right]
-            pose = b
+            pose = self.poses[right]
         else:
+            pose = self.poses[right].relative_to(self.poses[left])
             covariance = self._relative_covariance((left, right), pose)
-            std = _named_std(covariance, t)
+            std = _named_std(covariance, pose.t)
         cameras = self.cameras[left], self.cameras[right]
         pairs = tuple(
             (views[left], views[right]) for views in self.frames.values() if {left, right} <= set(views)

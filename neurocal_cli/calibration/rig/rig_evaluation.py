@@ -145,8 +145,7 @@ def _known(rig: Rig) -> dict[str, Pose]:
 
 def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
     """Poses of given frames in the first camera that fit all cameras of the rig best."""
-    from neurocal_cli.calibration.rig.adjust import adjust_rig, rig_problem
-    from neurocal_cli.calibration.rig.calibrate_rig import with_poses
+    from neurocal_cli.calibration.rig.calibrate_rig import poses_on_rig, with_poses
 
     usable, _ = with_poses(points)
     fits: dict[str, Calibration] = {
@@ -154,21 +153,7 @@ def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
         for name, one in usable.items()
     }
     views = match_views({name: fit.points.view_names for name, fit in fits.items()})
-    problem = rig_problem(list(fits.values()), views.of_views)
-    base = rig.poses[next(iter(fits))]
-    others = []
-    for name in list(fits)[1:]:
-        pose = rig.poses[name]
-        R = pose.R @ base.R.T
-        others.append(Pose(R, pose.t - R @ base.t))
-    start = problem.start(others)
-    state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
-    found = {}
-    for frame in np.flatnonzero(problem.together):
-        R = state.view_R[frame]
-        t = state.view_t[frame] * problem.scale[frame] - R @ problem.centre[frame]
-        found[views.names[frame]] = Pose.exact(base.R.T @ R, base.R.T @ (t - base.t))
-    return found
+    return poses_on_rig(rig.poses, fits, views)
 
 
 def _predicted(

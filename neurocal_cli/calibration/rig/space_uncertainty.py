@@ -78,6 +78,24 @@ def in_camera(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
     return turned + unit * state.t[side], np.concatenate([-cross_matrix(turned), shift], axis=2)
 
 
+def pixel_moves(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
+    """Derivatives of the pixels of points (N, 3) in one camera, (N, 2, 3) and (N, 2, n_shared).
+
+    They are by the points, in the first camera's frame, and by what the frames share.
+    """
+    own, by_pose = in_camera(fit, points, side)
+    by_camera, by_point = camera_in_pixels(fit, side).project_jacobian(own)
+    by_camera[:, :, :5] *= fit.problem.observations[side].pixel_scale
+    if fit.state.cameras[side].square:
+        by_camera[:, :, 0] += by_camera[:, :, 2]
+    columns = fit.state.columns
+    by_shared = np.zeros((len(points), 2, columns.n_shared))
+    by_shared[:, :, columns.cameras[side]] = by_camera
+    if side:
+        by_shared[:, :, columns.rigs[side]] = by_point @ by_pose
+    return by_point @ fit.state.R[side], by_shared
+
+
 def point_moves(
     fit: RigFit, points: Array, seen: NDArray[np.bool_], noise: Array | None = None
 ) -> tuple[Array, Array]:
@@ -86,21 +104,12 @@ def point_moves(
     They are in the first camera's frame [world unit], and `seen` (C, N) tells which cameras see them, each
     with its `noise` (C,), by default alike. Returns (N, 3, n_shared) and (N, 3, 3) arrays.
     """
-    columns = fit.state.columns
-    normal = np.zeros((len(points), 3, 3))
-    right, axes = np.zeros((len(points), 3, columns.n_shared)), np.arange(3)
+    normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, fit.state.columns.n_shared))
     for side, rows in enumerate(map(np.flatnonzero, seen)):
-        own, by_pose = in_camera(fit, points[rows], side)
-        by_camera, by_point = camera_in_pixels(fit, side).project_jacobian(own)
-        by_camera[:, :, :5] *= fit.problem.observations[side].pixel_scale
-        if fit.state.cameras[side].square:
-            by_camera[:, :, 0] += by_camera[:, :, 2]
-        J = by_point @ fit.state.R[side]
+        J, by_shared = pixel_moves(fit, points[rows], side)
         Jt = np.swapaxes(J, 1, 2) / (1.0 if noise is None else noise[side] ** 2)
         normal[rows] += Jt @ J
-        right[np.ix_(rows, axes, columns.cameras[side])] += Jt @ by_camera
-        if side:
-            right[np.ix_(rows, axes, columns.rigs[side])] += Jt @ by_point @ by_pose
+        right[rows] += Jt @ by_shared
     by_pixel = inverse_or_nan(normal)
     return -by_pixel @ right, by_pixel
 
@@ -142,11 +151,10 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     step = max(1, len(rows.left) // _MOST_POINTS)
     pixels = sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
     cameras = camera_in_pixels(fit, first), camera_in_pixels(fit, second)
-    R = state.R[second] @ state.R[first].T
-    pose = Pose(R, (state.t[second] - R @ state.t[first]) * problem.unit)
-    found = triangulate(*cameras, pose, *pixels)
+    one, other = (Pose.exact(state.R[side], problem.unit * state.t[side]) for side in (first, second))
+    found = triangulate(*cameras, other.relative_to(one), *pixels)
     kept = ~found.behind
-    points = (found.points[kept] - problem.unit * state.t[first]) @ state.R[first]
+    points = (found.points[kept] - one.t) @ one.R
     sees = np.isin(np.arange(len(problem.cameras)), (first, second))
     moves, _ = point_moves(fit, points, np.repeat(sees[:, None], len(points), axis=1))
     down = state.R[first][2] @ moves
