@@ -37,10 +37,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.cross_validation import (
+    Minimum,
     Quadratics,
     inverse_or_nan,
     quietly,
-    reduced,
     solve_or_nan,
 )
 from neurocal_cli.adjustment.normal_equations import Arrowhead, inverse_scaled, unit_diagonal
@@ -49,7 +49,6 @@ from neurocal_cli.adjustment.reprojection import (
     POSE,
     POSE_COLUMNS,
     camera_columns,
-    free_columns,
     normal_blocks,
     pose_response,
 )
@@ -80,9 +79,7 @@ class Covariance:
 class CovarianceBasis:
     """Input of a camera's covariance (`covariance`, `counting_views`)."""
 
-    # (V, 12 + K, 12 + K) as from `reprojection.normal_blocks`; if the target was estimated, with the
-    # efficient scores of the free camera parameters.
-    normal: Array
+    minimum: Minimum
     # (f, f) covariance of A's free entries and the free distortion coefficients, normalised, if it does not
     # follow from the normal matrices.
     shared: Array | None
@@ -95,18 +92,14 @@ class CovarianceBasis:
     poses: Array | None = None
 
 
-def covariance(
-    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float, shared: Array | None = None
-) -> Covariance:
-    """Invert the normal matrices (V, 12 + K, 12 + K) of a calibration, from `adjust`.
+def covariance(m: Minimum, n_equations: float, shared: Array | None = None) -> Covariance:
+    """Invert the normal matrices of a calibration, with the variance of the residuals of so many equations.
 
-    `free` (5 + K,) tells which of A's entries and the distortion coefficients are estimated. `n_residuals` is
-    the number of equations: two for most points; see `measured_directions`. If the covariance `shared` (f, f)
-    of the free entries and coefficients comes from elsewhere, the poses' covariance is propagated from it.
+    If the covariance `shared` (f, f) of the free entries and coefficients comes from elsewhere, the poses'
+    covariance is propagated from it.
     """
-    f, V = free_columns(free), len(normal)
-    variance = residual_variance(normal, free, free_pose, n_residuals)
-    if not free_pose:
+    normal, f, V, variance = m.normal, m.columns, len(m.normal), m.variance(n_equations)
+    if not m.free_poses:
         if shared is not None:
             return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
         U = normal[:, f[:, None], f].sum(axis=0)
@@ -119,12 +112,6 @@ def covariance(
     B_inverse, smallest = inverse_scaled(B, B)
     gain = normal[:, f, POSE] @ B_inverse
     return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)
-
-
-def residual_variance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float) -> float:
-    """Variance of the residuals, with the parameters of `covariance`."""
-    unknowns = int(free.sum()) + (6 * len(normal) if free_pose else 0)
-    return float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
 
 
 def entry_covariance(
@@ -239,28 +226,25 @@ _FEWEST = 3  # fewest poses: with one left out, two must still differ
 @quietly
 def counting_views(
     found: Covariance,
-    normal: Array,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    n_residuals: float,
-    repeated: RepeatedPoses,
+    m: Minimum,
+    n_equations: float,
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None,
     grown: float = np.inf,
 ) -> Covariance:
     """Covariances for residuals that are independent between views only.
 
-    The result is `found`, the covariance from the normal matrix, if the views contradict each other no more
-    than the residuals explain. `normal`, `free`, `free_poses` and `n_residuals` are as for
-    `covariance.covariance`. `moves_without` takes the pose number of each view and returns the moves of the
-    free parameters when the views of each pose are left out; it is needed if they do not follow from the
-    normal matrices. An estimated target may absorb contradictions between views that have other causes; only
-    the jackknife reveals those, and is used as well from `grown` times the variance that noise explains on.
+    The result is `found`, the `covariance` from the normal matrix, if the views, of which it is known which
+    repeat a pose, contradict each other no more than the residuals explain. `moves_without` takes the pose
+    number of each view and returns the moves of the free parameters when the views of each pose are left out;
+    it is needed if they do not follow from the normal matrices. An estimated target may absorb contradictions
+    between views that have other causes; only the jackknife reveals those, and is used as well from `grown`
+    times the variance that noise explains on.
     """
-    if not free.any() or not np.isfinite(found.entries).all():
+    repeated = m.repeated
+    assert repeated is not None
+    if not m.free.any() or not np.isfinite(found.entries).all():
         return found
-    variance = residual_variance(normal, free, free_poses, n_residuals)
-    whole = reduced(normal, free, free_poses)
-    entries = found.entries
+    variance, whole, entries = m.variance(n_equations), m.quadratics, found.entries
     told = _determined(whole.S.sum(axis=0))
     if told is not None:
         into, back = told
@@ -285,8 +269,8 @@ def counting_views(
     if told is not None:
         entries = found.entries + into @ (entries - before) @ into.T
     poses = found.poses
-    if free_poses:
-        gain = pose_response(normal, free_columns(free))
+    if m.free_poses:
+        gain = pose_response(m.normal, m.columns)
         poses = poses + gain @ (entries - found.entries) @ np.swapaxes(gain, 1, 2)
     return replace(found, entries=entries, poses=poses)
 

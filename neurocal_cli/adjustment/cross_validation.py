@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -167,14 +168,31 @@ def _eliminated(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> tup
 
 @frozen_dataclass(eq=False)
 class Minimum:
-    """A calibration at its minimum."""
+    """A calibration at its minimum, linearised."""
 
     views: Views
     state: CameraState
-    normal: Array  # (V, 12 + K, 12 + K) from `adjust`
-    free: NDArray[np.bool_]  # (5 + K,) of A's entries and the distortion coefficients
+    # (V, 12 + K, 12 + K) from `adjust`; if the target was estimated, with the efficient scores of the free
+    # parameters.
+    normal: Array
+    free: NDArray[np.bool_]  # (5 + K,) which of A's entries and the distortion coefficients are estimated
     free_poses: bool
     repeated: RepeatedPoses | None = None  # views that repeat a pose; they stay in the same fold
+
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Columns (f,) of the free parameters in the normal matrices."""
+        return free_columns(self.free)
+
+    @cached_property
+    def quadratics(self) -> Quadratics:
+        """The error of each view, with its pose eliminated."""
+        return reduced(self.normal, self.free, self.free_poses)
+
+    def variance(self, n_equations: float) -> float:
+        """Variance of the residuals of so many equations: two for most points; see `measured_directions`."""
+        unknowns = int(self.free.sum()) + (6 * len(self.normal) if self.free_poses else 0)
+        return float(self.normal[:, -1, -1].sum()) / max(n_equations - unknowns, 1)
 
 
 @quietly
@@ -185,51 +203,37 @@ def held_out(m: Minimum) -> Array:
     folds of each view's points.
     """
     if m.views.n_views > 1 and m.free.any():
-        lost = held_out_views(m.normal, m.free, m.free_poses, repeated=m.repeated)
+        lost = held_out_views(m)
         if np.isfinite(lost).all():
             return lost
-    return held_out_points(m.views, m.state, m.free, m.free_poses)
+    return held_out_points(m)
 
 
 @quietly
-def held_out_views(
-    normal: Array,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    penalty: _Penalty | None = None,
-    repeated: RepeatedPoses | None = None,
-) -> Array:
+def held_out_views(m: Minimum, penalty: _Penalty | None = None) -> Array:
     """Squared error of each view when it is held out; (V,), nan if the others do not determine the camera.
 
-    `normal`, `free` and `free_poses` are as for `reduced`. The penalty is a prior, added to the normal matrix
-    (f, f) of the shared parameters and to its right side (f,). Views that repeat a pose are held out
-    together.
+    The penalty is a prior, added to the normal matrix (f, f) of the shared parameters and to its right side
+    (f,). Views that repeat a pose are held out together.
     """
-    q = reduced(normal, free, free_poses)
-    fold = folds_of(len(q.cost), FOLDS) if repeated is None else repeated.folds(FOLDS)
-    return q.held_out(fold, penalty)
+    fold = folds_of(len(m.normal), FOLDS) if m.repeated is None else m.repeated.folds(FOLDS)
+    return m.quadratics.held_out(fold, penalty)
 
 
 @quietly
-def held_out_points(
-    views: Views,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    penalty: _Penalty | None = None,
-) -> Array:
+def held_out_points(m: Minimum, penalty: _Penalty | None = None) -> Array:
     """Squared error of the folds of each view's points when they are held out; (V * folds,).
 
     The folds are wedges of each view's image. Errors of a target are alike in neighbouring points, so random
     folds would reward a model that learns them.
     """
-    normal = _by_fold(views, state, _wedges(views))  # (V, F, W, W)
+    normal = _by_fold(m.views, m.state, _wedges(m.views))  # (V, F, W, W)
     rest = normal.sum(axis=1, keepdims=True) - normal
-    q, solved = _eliminated(rest, free, free_poses)
+    q, solved = _eliminated(rest, m.free, m.free_poses)
     S, g = q.S.sum(axis=0), q.g.sum(axis=0)
     camera = solve_or_nan(S, g) if penalty is None else solve_or_nan(S + penalty[0], g + penalty[1])  # (F, f)
     step = np.zeros((*normal.shape[:2], normal.shape[-1] - 1))
-    step[..., free_columns(free)] = camera
+    step[..., m.columns] = camera
     step[..., POSE] = solved[..., -1] - (solved[..., :-1] @ camera[:, :, None])[..., 0]
     return Quadratics(normal[..., :-1, :-1], normal[..., :-1, -1], normal[..., -1, -1]).at(step).reshape(-1)
 
@@ -269,7 +273,7 @@ def disagreement(m: Minimum) -> tuple[Array, Array]:
     repeated = m.repeated
     pose = np.arange(m.views.n_views) if repeated is None else repeated.group
     if pose.max() >= 3:
-        q = reduced(m.normal, m.free, m.free_poses)
+        q = m.quadratics
         half = (pose % 2 == np.arange(2)[:, None]).astype(float)
         S, g = q.summed(half)
         step = solve_or_nan(S, g)

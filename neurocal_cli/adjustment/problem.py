@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import OPTIONS, Adjusted, Penalty, adjust
+from neurocal_cli.adjustment.cross_validation import Minimum
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WIDE
@@ -147,6 +149,11 @@ class Problem:
             back = np.swapaxes(self.turned, 1, 2)
             state = replace(state, R=back @ state.R, t=(back @ state.t[..., None])[..., 0])
         return self.with_seen_pixels(), state
+
+    def minimum(self, adjusted: Adjusted, repeated: RepeatedPoses | None = None) -> Minimum:
+        """The linearised camera at a minimum; for `repeated` see there."""
+        free = self.free_with(adjusted.state.model)
+        return Minimum(self.views, adjusted.state, adjusted.normal, free, self.free_poses, repeated)
 
     def adjust(
         self,

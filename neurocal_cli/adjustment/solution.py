@@ -145,8 +145,8 @@ class Solution:
     @cached_property
     def covariance(self) -> Covariance:
         """Covariances from the normal matrices alone, for a target that is as given."""
-        problem, n = self.problem, self.problem.views.n_equations + self.by_prior
-        return covariance(self.adjusted.normal, problem.free_camera, problem.free_poses, n, self.shared)
+        n = self.problem.views.n_equations + self.by_prior
+        return covariance(self.problem.minimum(self.adjusted), n, self.shared)
 
     @cached_property
     def alike(self) -> float:

@@ -52,13 +52,18 @@ def calibration_of(
         posterior = None
     known = camera_covariance(
         CameraSeen(
-            views, state, adjusted.normal, problem.free_camera, problem.free_poses, solution.repeated,
-            problem.points, solution.target, posterior, tuple(solution.model_errors or ()),
-            solution.shared, solution.by_prior, solution.target_kept,
+            problem.minimum(adjusted, solution.repeated),
+            problem.points,
+            solution.target,
+            posterior,
+            tuple(solution.model_errors or ()),
+            solution.shared,
+            solution.by_prior,
+            solution.target_kept,
             solution.covariance if solution.target is None else None,
             solution.alike,
         )
-    )  # fmt: skip
+    )
     refuse_undetermined(problem, state, known.plain)
     cov = known.found
     A = problem.matrix(state.entries[0])

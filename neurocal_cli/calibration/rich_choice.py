@@ -112,4 +112,4 @@ def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:
     """(V,) squared error of each view when it is left out."""
     problem, state, free = solution.problem, solution.state, solution.problem.free_camera
     held = None if problem.penalty is None else normal_part(problem.penalty, state, free)
-    return held_out_views(solution.adjusted.normal, free, True, held, repeated)
+    return held_out_views(problem.minimum(solution.adjusted, repeated), held)

@@ -71,7 +71,7 @@ def test_points_left_out_of_a_single_view_cost_more_than_those_kept() -> None:
     while len(scene.world) < 100:
         scene = random_solid(rng, 1, False)
     views, adjusted = solved(scene, scene.points(0.3, rng))
-    lost = held_out_points(views, adjusted.state, FREE, True)
+    lost = held_out_points(Minimum(views, adjusted.state, adjusted.normal, FREE, True))
     assert adjusted.cost.sum() < lost.sum() < 2 * adjusted.cost.sum()
 
 

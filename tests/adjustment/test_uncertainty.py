@@ -13,6 +13,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences
 from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration
@@ -120,7 +121,8 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
         return
     scene = random_flat_set(np.random.default_rng(1), 5, False, cols=6, rows=5)
     views = arrange(scene.points(0.5, np.random.default_rng(2)))
-    normal, _ = normal_blocks(views.batches, scene.true_state(views))
+    state = scene.true_state(views)
+    normal, _ = normal_blocks(views.batches, state)
     whole = np.zeros((len(f) + 30 * poses,) * 2)
     whole[: len(f), : len(f)] = normal[:, f[:, None], f].sum(axis=0)
     for k in range(5 * poses):
@@ -130,7 +132,7 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
         whole[mine, : len(f)] = normal[k][f, 5:11].T
     variance = normal[:, 11, 11].sum() / (2 * len(scene.view) - len(whole))
     expected = variance * np.linalg.inv(whole)
-    found = covariance(normal, np.array(free, dtype=bool), poses, 2 * len(scene.view))
+    found = covariance(Minimum(views, state, normal, np.array(free, bool), poses), 2 * len(scene.view))
     np.testing.assert_allclose(found.entries, expected[: len(f), : len(f)], rtol=1e-8)
     for k in range(5):
         mine = slice(len(f) + 6 * k, len(f) + 6 * k + 6)
@@ -144,14 +146,15 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
 def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
     scene = random_flat_set(np.random.default_rng(1), 3, False, cols=6, rows=5)
     views = arrange(scene.points())
-    normal, _ = normal_blocks(views.batches, scene.true_state(views))
+    state = scene.true_state(views)
+    normal, _ = normal_blocks(views.batches, state)
     normal[1, 5:11] = normal[1, :, 5:11] = 0.0  # a pose that nothing depends on
-    assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest == 0
+    assert covariance(Minimum(views, state, normal, np.ones(5, bool), True), 180).smallest == 0
     # Without the third view's tilt the focal length and the distance are one unknown.
     state = scene.true_state(views)
     flat = CameraState(state.entries, np.tile(np.eye(3), (3, 1, 1)), np.tile([0.0, 0.0, 5.0], (3, 1)))
     normal, _ = normal_blocks(views.batches, flat)
-    assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest < 1e-13
+    assert covariance(Minimum(views, state, normal, np.ones(5, bool), True), 180).smallest < 1e-13
 
 
 @pytest.mark.parametrize(

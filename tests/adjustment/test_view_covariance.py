@@ -14,7 +14,7 @@ from neurocal_cli.adjustment import covariance as covariance_module
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.chi_squared import chi_squared, exceeded_by_chance
 from neurocal_cli.adjustment.covariance import counting_views, covariance
-from neurocal_cli.adjustment.cross_validation import Quadratics, reduced
+from neurocal_cli.adjustment.cross_validation import Minimum, Quadratics
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict.assessment import _AtMinimum
@@ -43,9 +43,9 @@ def scores(n_views: int, seeds: range) -> list[bool]:
         scene = random_flat_set(rng, n_views, False, cols=8, rows=6, f=900.0, width=1280)
         views = arrange(scene.points(0.2, rng))
         found = adjust(views.batches, scene.true_state(views), NO_SKEW, True)
-        given = found.normal, NO_SKEW, True, views.n_equations
-        cov = covariance(*given)
-        taken.append(counting_views(cov, *given, own_poses(n_views)) is not cov)
+        m = Minimum(views, found.state, found.normal, NO_SKEW, True, own_poses(n_views))
+        cov = covariance(m, views.n_equations)
+        taken.append(counting_views(cov, m, views.n_equations) is not cov)
     return taken
 
 
@@ -92,8 +92,7 @@ def test_errors_of_clean_views_are_as_the_std_say(n_views: int) -> None:
 
 def noise_std(views: Views, found: Calibration) -> float:
     """Std of alpha_u from the normal matrix alone."""
-    m = _AtMinimum(found)
-    entries = covariance(m.normal, m.free, m.free_poses, views.n_equations).entries
+    entries = covariance(_AtMinimum(found).minimum, views.n_equations).entries
     return float(np.sqrt(entries[0, 0])) * views.pixel_scale
 
 
@@ -125,9 +124,9 @@ def test_the_covariance_is_nowhere_below_the_normal_matrix_s(monkeypatch: pytest
     scene = random_flat_set(rng, 6, False, cols=8, rows=6)
     views = arrange(scene.points(0.2, rng))
     found = adjust(views.batches, scene.true_state(views), NO_SKEW, True)
-    given = found.normal, NO_SKEW, True, views.n_equations
+    given = Minimum(views, found.state, found.normal, NO_SKEW, True, own_poses(6)), views.n_equations
     noise = covariance(*given)
-    counted = counting_views(noise, *given, own_poses(6))
+    counted = counting_views(noise, *given)
     scale = np.sqrt(np.diagonal(noise.entries))
     more = (counted.entries - noise.entries) / np.outer(scale, scale)
     assert np.linalg.eigvalsh(more).min() > -1e-9
@@ -142,8 +141,8 @@ def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
     options = {"skew": False, "distortion": "k1k2", "outliers": "keep", "target": "given"}
     whole = calibrate(points, **options)
     others = [calibrate(points.select(points.view_index != k), **options) for k in range(10)]
-    m = _AtMinimum(whole)
-    told = covariance_module.jackknife(reduced(m.normal, m.free, True).moves_without_each())
+    m = _AtMinimum(whole).minimum
+    told = covariance_module.jackknife(m.quadratics.moves_without_each())
     alphas = np.array([c.intrinsics.alpha_u for c in others])
     jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())
     assert np.sqrt(told[0, 0]) * m.views.pixel_scale == pytest.approx(jackknife, rel=0.05)
@@ -180,9 +179,10 @@ def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_
     def std(*blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         whole = np.concatenate(blocks, axis=2)
         normal = np.swapaxes(whole, 1, 2) @ whole
-        given = normal, np.ones(normal.shape[1] - 7, dtype=bool), True, V * rows
+        free = np.ones(normal.shape[1] - 7, dtype=bool)
+        given = Minimum(None, None, normal, free, True, own_poses(V)), V * rows
         plain = covariance(*given)
-        entries = counting_views(plain, *given, own_poses(V)).entries
+        entries = counting_views(plain, *given).entries
         return np.sqrt(np.diagonal(plain.entries)[:5]), np.sqrt(np.diagonal(entries)[:5])
 
     plain, one = std(J, residual)

@@ -76,12 +76,11 @@ def test_each_view_is_bent_as_it_was() -> None:
 
 def test_bends_are_integrated_out_of_what_each_view_tells() -> None:
     target, (problem, adjusted) = found().target, fit_of(found())
-    asked = problem.free_camera, problem.free_poses
-    basis = covariance_basis(target, problem.views, adjusted.state, *asked, problem.points, adjusted.normal)
+    basis = covariance_basis(target, problem.minimum(adjusted), problem.points)
     assert basis.shared is not None
-    views = covariance(basis.normal, *asked, basis.n_equations).entries
+    views = covariance(basis.minimum, basis.n_equations).entries
     np.testing.assert_allclose(np.diagonal(views), np.diagonal(basis.shared), rtol=0.02)
-    fixed = covariance(adjusted.normal, *asked, basis.n_equations).entries
+    fixed = covariance(problem.minimum(adjusted), basis.n_equations).entries
     assert (np.diagonal(fixed) < np.diagonal(basis.shared)).all()
 
 

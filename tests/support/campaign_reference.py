@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def reference(points: Correspondences, truth: Truth) -> Reference:
     else:  # the noise without them
         normal = best.normal.copy()
         normal[:, -1, -1] = 2 * problem.views.counts * (truth.sigma / problem.views.pixel_scale) ** 2
-    cov = covariance(normal, problem.free_camera, True, problem.views.n_equations)
+    cov = covariance(problem.minimum(replace(best, normal=normal)), problem.views.n_equations)
     spread = float(np.sqrt(cov.entries[0, 0]) / best.state.entries[0, 0])
     return Reference(truth, spread if np.isfinite(spread) else np.inf)
 

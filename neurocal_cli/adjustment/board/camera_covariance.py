@@ -12,24 +12,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import (
-    Covariance,
-    CovarianceBasis,
-    counting_views,
-    covariance,
-    residual_variance,
-)
-from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import free_columns, normal_blocks, pose_response
+from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, counting_views, covariance
+from neurocal_cli.adjustment.cross_validation import Minimum
+from neurocal_cli.adjustment.reprojection import normal_blocks, pose_response
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import TargetPosterior
-from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
@@ -47,14 +37,9 @@ _FEW, _GROWN_OF_FEW = 5, 6.0
 
 @frozen_dataclass(eq=False)
 class CameraSeen:
-    """A camera at its minimum, with its observations; the first six fields are as for `counting_views`."""
+    """A camera at its minimum, of which it is known which views repeat a pose, with its observations."""
 
-    views: Views
-    state: CameraState
-    normal: Array  # from `reprojection.normal_blocks`
-    free: NDArray[np.bool_]
-    free_poses: bool
-    repeated: RepeatedPoses
+    minimum: Minimum
     points: Correspondences  # with the world coordinates of the estimated target, if any
     target: Target | None = None  # the estimated target
     # Function that returns the posterior of the target for a variance of the noise, if there is one already.
@@ -102,22 +87,21 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
     Raises `numpy.linalg.LinAlgError` if the points do not determine a camera whose target was estimated.
     """
-    asked = seen.free, seen.free_poses
-    basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared, seen.posterior)
-    plain = seen.plain or covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
+    basis = _basis(seen, seen.minimum, seen.shared, seen.posterior)
+    m, n = basis.minimum, basis.n_equations
+    plain = seen.plain or covariance(m, n + seen.by_prior, basis.shared)
     if basis.poses is not None:
         plain = replace(plain, poses=basis.poses)
     if seen.shared is not None:
         return CameraCovariance(basis, plain, plain)
     grown = np.inf  # a surveyed target absorbs no more than the stated errors of its points
     if seen.target is not None and seen.target.stated is None:
-        few = _GROWN_OF_FEW if seen.repeated.n_poses <= _FEW else np.inf
+        assert m.repeated is not None
+        few = _GROWN_OF_FEW if m.repeated.n_poses <= _FEW else np.inf
         grown = few if seen.target.bends is None else _GROWN
-    found = counting_views(
-        plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without, grown
-    )
+    found = counting_views(plain, m, n, basis.moves_without, grown)
     known = CameraCovariance(basis, plain, found)
-    kept = seen.target_kept and seen.free_poses and bool(seen.free.any())
+    kept = seen.target_kept and m.free_poses and bool(m.free.any())
     if not np.isfinite(found.entries).all() or not (seen.choice or kept):
         return known
     variance = _variance(seen, basis)
@@ -131,19 +115,20 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     """Add the uncertainty from the selection of the distortion model."""
     from neurocal_cli.adjustment import open_choices as choices
 
-    views, state = seen.views, seen.state
+    m = seen.minimum
+    views, state = m.views, m.state
     corner = choices.corner_radius(
         state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
     )
     richer = choices.open_coefficients(
-        state.model, state.k, seen.free, seen.choice, choices.radius(views, state), corner
+        state.model, state.k, m.free, seen.choice, choices.radius(views, state), corner
     )
     if richer is None:
         return known
     state = richer.state(state)
     normal, _ = normal_blocks(views.batches, state)
-    normal = _basis(seen, state, richer.free, normal).normal
-    q = reduced(normal, richer.free, seen.free_poses)
+    m = _basis(seen, replace(m, state=state, normal=normal, free=richer.free)).minimum
+    q = m.quadratics
     left_out = richer.prior.left_out
     spread = choices.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     E, follow = spread.E, spread.follow
@@ -151,18 +136,19 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     if not np.isfinite(entries).all():
         return known
     poses = known.found.poses
-    if seen.free_poses:
-        gain = pose_response(normal, free_columns(richer.free)) @ follow
+    if m.free_poses:
+        gain = pose_response(m.normal, m.columns) @ follow
         poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
     found = replace(known.found, entries=entries[np.ix_(~left_out, ~left_out)], poses=poses)
-    return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
+    return replace(known, found=found, wide=WideCovariance(richer, m.normal, entries))
 
 
 def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """Add the uncertainty from keeping the given target."""
     from neurocal_cli.adjustment.open_choices import open_stretch
 
-    added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
+    m = seen.minimum
+    added = open_stretch(m.views, m.state, m.free, seen.points.world, variance)
     if added is None:
         return known
     entries, poses = known.found.entries + added.entries, known.found.poses + added.poses
@@ -177,24 +163,23 @@ def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> Ca
 
 def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
     """Residual variance, enlarged for residuals correlated between neighbours or repeated poses."""
-    views = seen.views
-    alike = correlation(views, point_residuals(views, seen.state)) if seen.alike is None else seen.alike
-    worth = effective_number(views.n_equations, alike) / views.n_equations * seen.repeated.worth
-    return residual_variance(basis.normal, seen.free, seen.free_poses, basis.n_equations) / worth
+    views, repeated = seen.minimum.views, seen.minimum.repeated
+    assert repeated is not None
+    alike = seen.alike
+    if alike is None:
+        alike = correlation(views, point_residuals(views, seen.minimum.state))
+    worth = effective_number(views.n_equations, alike) / views.n_equations * repeated.worth
+    return basis.minimum.variance(basis.n_equations) / worth
 
 
 def _basis(
     seen: CameraSeen,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    normal: Array,
+    m: Minimum,
     shared: Array | None = None,
     posterior: Callable[[float], TargetPosterior] | None = None,
 ) -> CovarianceBasis:
     if seen.target is None:
-        return CovarianceBasis(normal, shared, seen.views.n_equations)
+        return CovarianceBasis(m, shared, m.views.n_equations)
     from neurocal_cli.adjustment.board.uncertainty import covariance_basis
 
-    return covariance_basis(
-        seen.target, seen.views, state, free, seen.free_poses, seen.points, normal, posterior
-    )
+    return covariance_basis(seen.target, m, seen.points, posterior)

@@ -31,11 +31,11 @@ from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.validation import without_each
 from neurocal_cli.adjustment.covariance import CovarianceBasis
+from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.solution import TargetPosterior
-from neurocal_cli.adjustment.views import Views, products
+from neurocal_cli.adjustment.views import products
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import N_SHAPES, Target, surface_of
 
@@ -46,12 +46,8 @@ _MOST_POSES = 40
 
 def covariance_basis(
     target: Target,
-    views: Views,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    free_poses: bool,
+    m: Minimum,
     points: Correspondences,
-    normal: Array,
     posterior: Callable[[float], TargetPosterior] | None = None,
 ) -> CovarianceBasis:
     """Input of the covariance of a camera at its minimum, for an estimated target; see `CameraSeen`.
@@ -59,10 +55,10 @@ def covariance_basis(
     For a variance of the noise [px^2], `posterior` returns that of the target at this minimum; without it,
     that is computed here. Raises `numpy.linalg.LinAlgError` if the points do not determine the camera.
     """
-    label = target.rows_of(target.straightened(points).world)
+    views, label = m.views, target.rows_of(target.straightened(points).world)
     label = label if views.order is None else label[views.order]
     prior, n = prior_of_target(target), len(target.given)
-    sight = Sight(views, state, free, free_poses, label)
+    sight = Sight(views, m.state, m.free, m.free_poses, label)
     bent, bends = 0.0, np.zeros((views.n_views, N_SHAPES))  # effective number that the data determine
     if target.bends is not None:
         bends = target.bends.of_views(views.names)
@@ -75,9 +71,7 @@ def covariance_basis(
         return info.turned(prior.axes).around_given(offsets)
 
     if prior.stated is None:
-        unknowns = int(free.sum()) + (6 * views.n_views if free_poses else 0)
-        spare = views.n_equations - unknowns - bent
-        variance = float(normal[:, -1, -1].sum()) * views.pixel_scale**2 / spare
+        variance = m.variance(views.n_equations - bent) * views.pixel_scale**2
     else:
         variance = noise_variance(in_offsets(information_of([sight], n)), prior, target.sizes["stated"])
 
@@ -104,10 +98,10 @@ def covariance_basis(
     normal = _efficient(sight, np.einsum("fni,nji->fnj", found.followed, prior.axes))
     if target.bends is not None:
         normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
-    poses = found.poses if free_poses else None
+    poses = found.poses if m.free_poses else None
     return CovarianceBasis(
-        normal, found.variance * found.camera, views.n_equations - found.determined - bent, moves_without,
-        None if poses is None else found.variance * poses,
+        replace(m, normal=normal), found.variance * found.camera, views.n_equations - found.determined - bent,
+        moves_without, None if poses is None else found.variance * poses,
     )  # fmt: skip
 
 

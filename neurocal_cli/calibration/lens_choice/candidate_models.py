@@ -272,18 +272,15 @@ def _assessed(
     """A fit with the measures for the selection; None if a part of the data is indispensable."""
     views, state, free = problem.views, adjusted.state, problem.free_camera
     held = None if problem.penalty is None else normal_part(problem.penalty, state, free)
-    if by_views:
-        lost = held_out_views(adjusted.normal, free, problem.free_poses, held, repeated)
-    else:
-        lost = held_out_points(views, state, free, problem.free_poses, held)
+    m = problem.minimum(adjusted, repeated)
+    lost = held_out_views(m, held) if by_views else held_out_points(m, held)
     if not np.isfinite(lost).all():
         if state.model != "none":
             return None
         lost = np.full_like(lost, np.inf)
-    given = adjusted.normal, free, problem.free_poses, views.n_equations
-    cov = covariance(*given)
+    cov = covariance(m, views.n_equations)
     if repeated is not None:
-        cov = counting_views(cov, *given, repeated)
+        cov = counting_views(cov, m, views.n_equations)
     noise = _noise(problem.distortion.model, state, reach, cov.entries)
     bad = folds_back(problem, state)
     try:

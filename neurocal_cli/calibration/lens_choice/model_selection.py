@@ -166,9 +166,7 @@ def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = No
     problem, adjusted = solution.problem, solution.adjusted
     if problem.views.n_views == 1 or not problem.free_camera.any():
         return False
-    free = problem.free_with(adjusted.state.model)
-    lost = held_out_views(adjusted.normal, free, problem.free_poses, repeated=repeated)
-    return bool(np.isfinite(lost).all())
+    return bool(np.isfinite(held_out_views(problem.minimum(adjusted, repeated))).all())
 
 
 def _least_held_out(fitted: dict[str, Candidate]) -> float:

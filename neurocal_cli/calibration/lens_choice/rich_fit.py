@@ -32,7 +32,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from neurocal_cli.adjustment.common_noise import reweighted
-from neurocal_cli.adjustment.cross_validation import held_out_views, reduced
+from neurocal_cli.adjustment.cross_validation import Minimum, held_out_views, reduced
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.adjustment.open_choices import fisheye_sizes
 from neurocal_cli.adjustment.problem import Problem
@@ -97,10 +97,11 @@ def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
     processes, sizes = _beginning(problem, state, normal)
     found = _sizes(problem, state, normal, processes, sizes)
     free = problem.free_camera
-    n, m = int(free.sum()), len(_UNKNOWNS)
-    held = np.pad(found.precision, (n - m, 0))
-    missing = np.pad(-found.precision @ state.k[_UNKNOWNS], (n - m, 0))
-    return held_out_views(normal, free, problem.free_poses, (held, missing), repeated)
+    others = int(free.sum()) - len(_UNKNOWNS)
+    held = np.pad(found.precision, (others, 0))
+    missing = np.pad(-found.precision @ state.k[_UNKNOWNS], (others, 0))
+    m = Minimum(problem.views, state, normal, free, problem.free_poses, repeated)
+    return held_out_views(m, (held, missing))
 
 
 def _begun(solution: Solution) -> Solution:

@@ -177,7 +177,7 @@ class _Profile:
         """Whether the profile over all possible xi agrees with the covariance at the best minimum."""
         problem, best = self.problem, self.best
         free = problem.free_camera
-        cov = covariance(best.normal, free, problem.free_poses, problem.views.n_equations)
+        cov = covariance(problem.minimum(best), problem.views.n_equations)
         variance = float(cov.entries[int(free[:5].sum()), int(free[:5].sum())])
         if not variance > 0 or not cov.smallest > 1e-12:
             return False

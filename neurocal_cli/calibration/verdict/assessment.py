@@ -194,20 +194,18 @@ class _AtMinimum:
         self.free_poses = not all(view.fixed for view in views)
         state = normalised(self.given, self.views)
         adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
-        self.state, self.normal = adjusted.state, adjusted.normal
-        self.cost = float(self.normal[:, -1, -1].sum())
+        self.state, self.cost = adjusted.state, float(adjusted.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.errors = point_residuals(self.views, self.state)
         self.repeated = repeated_poses(self.views, self.state, self.errors)
         known = camera_covariance(
             CameraSeen(
-                self.views, self.state, self.normal, self.free, self.free_poses, self.repeated,
+                Minimum(self.views, self.state, adjusted.normal, self.free, self.free_poses, self.repeated),
                 self.points, calibration.target, choice=tuple(calibration.lens_choice),
                 target_kept=calibration.target_stretched > 0,
             )
         )  # fmt: skip
-        self.normal = known.basis.normal
-        self.minimum = Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
+        self.minimum = known.basis.minimum
         self.spare = max(known.basis.n_equations - self.unknowns, 1)
         self.variance = self.cost / self.spare
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
@@ -300,7 +298,7 @@ class _AtMinimum:
         at -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
         """
         free, shared = self._stored()
-        q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
+        q, fold = reduced(self.minimum.normal, free, self.free_poses), self.repeated.folds(FOLDS)
         S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
         inverse = shared / self.variance
         steps = np.linalg.solve(inverse @ S - np.eye(len(shared)), (g @ inverse)[..., None])[..., 0]
@@ -374,9 +372,7 @@ class _AtMinimum:
         if not np.isfinite(cov).all():
             return np.nan
         # What is reported beyond independent noise concerns both halves, and four times their difference.
-        independent = self.variance * inverse_or_nan(
-            reduced(self.normal, self.free, self.free_poses).S.sum(axis=0)
-        )
+        independent = self.variance * inverse_or_nan(self.minimum.quadratics.S.sum(axis=0))
         values, vectors = np.linalg.eigh(np.nan_to_num(self.covariance - independent))
         cov = self.variance * cov + 4 * (vectors * np.maximum(values, 0.0)) @ vectors.T
         return chi_squared(difference, cov) / len(difference)
