@@ -35,7 +35,7 @@ def test_the_common_camera_tells_nearly_what_many_steps_leave(name: str, distort
     points = read_points(FLAT.with_name(f"{name}.csv"))
     found = _AtMinimum(calibrate(points, distortion=distortion, outliers="keep", target="given"))
     left = free_networks(found.views, found.state, 60).sum()
-    assert np.sqrt(least_of_free_networks(found.normal).sum() / left) == pytest.approx(1.0, abs=0.1)
+    assert np.sqrt(least_of_free_networks(found.minimum.normal).sum() / left) == pytest.approx(1.0, abs=0.1)
 
 
 def test_views_that_the_camera_fits_exactly_leave_nothing() -> None:
