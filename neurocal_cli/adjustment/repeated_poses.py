@@ -129,8 +129,7 @@ def _correlation(views: Views, errors: Array, group: NDArray[np.intp]) -> float:
     size = np.bincount(group)
     rows = np.flatnonzero((size > 1)[group][views.index])
     view = views.index[rows]
-    world = views.local[rows] * views.scale[view, None] + views.centre[view]
-    place = np.round(world / (1e-6 * views.scale[0]))
+    place = np.round(views.world[rows] / (1e-6 * views.scale[0]))
     key = np.column_stack([group[view], place])
     _, same = distinct_rows(key)
     n = np.bincount(same)

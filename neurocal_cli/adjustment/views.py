@@ -75,6 +75,11 @@ class Views:
         """(N,) number of each point within its view, from 0."""
         return np.arange(len(self.index)) - np.repeat(self.first, self.counts)
 
+    @property
+    def world(self) -> Array:
+        """(N, 3) world points [world unit]."""
+        return self.local * self.scale[self.index, None] + self.centre[self.index]
+
     @cached_property
     def equations(self) -> Array:
         """(V,) number of equations that each view's points give."""

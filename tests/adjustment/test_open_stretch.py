@@ -88,7 +88,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     assert found is not None
     stretch = np.eye(3) + EPS * stretches(left.points.world)[0]
     observations = [
-        replace(seen, batches=replace(seen.batches, local=stretch @ seen.batches.local))
+        replace(seen, views=replace(seen.views, local=seen.views.local @ stretch.T))
         for seen in problem.observations
     ]
     problem = replace(problem, observations=(observations[0], observations[1]))

@@ -135,9 +135,9 @@ def all_residuals(problem: RigProblem, state: RigState) -> Array:
     """Whitened residuals, computed through no more than the cameras' own projections."""
     out = []
     for side, seen in enumerate(problem.observations):
-        camera = problem.camera(state, side)
-        error = residuals(seen.batches, camera)
-        if seen.batches.whitening is not None:
-            error = error * (seen.batches.whitening[:, :1] > 0)
+        camera, batches = problem.camera(state, side), seen.views.batches
+        error = residuals(batches, camera)
+        if batches.whitening is not None:
+            error = error * (batches.whitening[:, :1] > 0)
         out.append(np.sqrt(seen.weight) * error.ravel())
     return np.concatenate(out)

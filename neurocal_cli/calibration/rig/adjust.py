@@ -17,12 +17,13 @@ from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
 from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SharedAndOwn, solve_scaled
+from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.reprojection import (
     POSE_COLUMNS,
     free_columns,
     normal_blocks,
 )
-from neurocal_cli.adjustment.views import Views, batches_of
+from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.rig.frames import frames_of_pairs
@@ -35,7 +36,6 @@ from neurocal_cli.calibration.rig.problem import (
 from neurocal_cli.calibration.verdict.findings import TOLD
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median, orthonormalised
-from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState
 
 # A state, its normal equations, and those of the unknowns that move.
@@ -65,13 +65,12 @@ def rig_problem(calibrations: Sequence[Calibration], frames: Frames) -> RigProbl
         for camera, own, which in zip(calibrations, arranged, frames, strict=True)
     ]
     seen, states, normals, noise = zip(*sides, strict=True)
-    real = [observed.pixel_scale * s for observed, s in zip(seen, noise, strict=True)]
+    real = [observed.views.pixel_scale * s for observed, s in zip(seen, noise, strict=True)]
     weights = [
         1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2 for s, own in zip(noise, real, strict=True)
     ]
     return RigProblem(
         calibrations=tuple(calibrations),
-        names=tuple(own.names for own in arranged),
         centre=centre,
         scale=scale,
         unit=float(median(scale)),
@@ -107,24 +106,12 @@ def _side(
     """
     local = views.local * np.repeat(views.scale / scale, views.counts)[:, None]
     local += np.repeat((views.centre - centre) / scale[:, None], views.counts, axis=0)
-    batches = batches_of(local, views.pixels, views.whitening, views.index, views.n_views)
-    entries = calibration.K[ENTRIES]
-    entries[3:] -= views.pixel_centre
-    poses = [calibration.views[name].pose for name in views.names]
-    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-    state = CameraState(
-        entries[None] / views.pixel_scale,
-        R,
-        ((R @ centre[..., None])[..., 0] + t) / scale[:, None],
-        calibration.distortion_model,
-        np.array(calibration.distortion, dtype=float),
-        calibration.square_pixels,
-    )
-    normal, free = normal_blocks(batches, state)[0], free_parameters(calibration)
+    views = replace(views, local=local, centre=centre, scale=scale)
+    state = normalised(calibration.state(views.names), views)
+    normal, free = normal_blocks(views.batches, state)[0], free_parameters(calibration)
     spare = views.n_equations - int(free.sum()) - 6 * views.n_views
     noise = max(float(np.sqrt(cost_alone(normal, free) / max(spare, 1))), _LEAST_NOISE)
-    observed = Observations(batches, frame, views.pixel_centre, views.pixel_scale, 1.0, views.n_equations)
-    return observed, state, normal, noise
+    return Observations(views, frame, 1.0), state, normal, noise
 
 
 def cost_alone(normal: Array, free: NDArray[np.bool_]) -> float:
@@ -157,7 +144,7 @@ class RigFit:
     @property
     def variance(self) -> float:
         """Of the whitened residuals; 1 where both cameras alone leave no less."""
-        equations = sum(observed.n_equations for observed in self.problem.observations)
+        equations = sum(observed.views.n_equations for observed in self.problem.observations)
         unknowns = int(self.free.sum()) + 6 * len(self.problem.scale)
         return self.cost / max(equations - unknowns, 1)
 
@@ -206,7 +193,7 @@ def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) ->
         return after, sensible and positive
 
     error = SharedAndOwn(linearised(start)[0], lambda at: at[2], moved)
-    floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in problem.observations)
+    floor = FLOOR**2 * sum(seen.views.n_equations * seen.weight for seen in problem.observations)
     outcome = minimise(error, replace(OPTIONS, damping=_DAMPING), floor)
     state, normal, _ = error.state
     state = replace(state, R=orthonormalised(state.R), view_R=orthonormalised(state.view_R))

@@ -133,9 +133,10 @@ class _Pair:
         in_rig, rows = self._in_rig(view), []
         for which, side in enumerate(self.indices):
             points, observed = in_rig[self._shown(which, in_rig)], self.fit.problem.observations[side]
+            noise = observed.views.pixel_scale / np.sqrt(observed.weight)
             by_point, by_shared = pixel_moves(self.fit, points, side)
             both = np.concatenate([by_shared[:, :, self.columns], by_point @ _moved(points, 1.0)], axis=2)
-            rows.append(both.reshape(-1, both.shape[2]) * (np.sqrt(observed.weight) / observed.pixel_scale))
+            rows.append(both.reshape(-1, both.shape[2]) / noise)
         J, P = np.split(np.concatenate(rows), [len(self.columns)], axis=1)
         C = J.T @ P
         return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T) / self.fit.variance

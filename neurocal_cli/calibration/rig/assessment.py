@@ -96,7 +96,7 @@ def _evidence(rig: Rig) -> _Evidence:
     names = list(rig.cameras)
     fit = fitted(rig)
     squares, degrees = scatter(fit)
-    equations = sum(observed.n_equations for observed in fit.problem.observations)
+    equations = sum(observed.views.n_equations for observed in fit.problem.observations)
     spare = max(equations - 6 * sum(map(len, fit.problem.names)) - int(fit.free.sum()), 1.0)
     alone = max(fit.cost - squares, 1e-300)
     cause, rest = named_cause(fit, names)

@@ -382,7 +382,7 @@ def seen_by(fit: RigFit, side: int, free: NDArray[np.intp]) -> SeenBy:
     """What the views of a camera say, with these free shared unknowns (f,)."""
     problem, state = fit.problem, fit.state
     observed = problem.observations[side]
-    N = observed.weight * normal_blocks(observed.batches, problem.camera(state, side))[0]
+    N = observed.weight * normal_blocks(observed.views.batches, problem.camera(state, side))[0]
     of_rig, by_rig, by_pose = problem.pose_steps(state, side)
     shared = np.zeros((len(N), 8, len(fit.free) + 1))
     shared[:, :, -1] = N[:, _FREE, -1]

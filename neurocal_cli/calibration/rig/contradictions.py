@@ -175,7 +175,7 @@ def fitting(still: RigFit) -> list[NDArray[np.bool_]]:
     problem, state = still.problem, still.state
     more, views = np.zeros(len(problem.scale)), np.zeros(len(problem.scale))
     for side, observed in enumerate(problem.observations):
-        cost = observed.weight * squared_errors(observed.batches, problem.camera(state, side))
+        cost = observed.weight * squared_errors(observed.views.batches, problem.camera(state, side))
         more[observed.view] += cost - problem.own_normal[side][:, -1, -1]
         views[observed.view] += 1
     apart = more / np.maximum(views - 1, 1)

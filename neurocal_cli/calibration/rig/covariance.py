@@ -27,7 +27,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.information import Information, point_terms
+from neurocal_cli.adjustment.board.information import Information, labelled, point_terms
 from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
@@ -43,7 +43,7 @@ from neurocal_cli.adjustment.open_choices import (
 )
 from neurocal_cli.adjustment.reprojection import camera_columns, stretched_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
-from neurocal_cli.calibration.rig.problem import Observations, RigProblem, RigState
+from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
@@ -131,26 +131,18 @@ def information_of_rig(target: Target, fit: RigFit) -> Information:
     point, by_shared = np.zeros((n, 3, 3)), np.zeros((n, 3, columns.n_shared + 1))
     pose_point = np.zeros((len(problem.scale), 6, n, 3))
     for side, (observed, own) in enumerate(zip(problem.observations, columns.cameras, strict=True)):
-        label, scale = _labels(target, problem, observed), problem.scale[observed.view]
+        views = observed.views
+        label = labelled(views, target.rows_of(views.world))
         camera, shared_columns = problem.camera(state, side), camera_columns(len(own) - 5)
-        terms = point_terms(observed.batches, camera, scale, label, shared_columns, n)
+        terms = point_terms(views.batches, camera, views.scale, label, shared_columns, n)
         w, (of_rig, by_rig, by_pose) = observed.weight, problem.pose_steps(state, side)
         point += w * terms.point
         by_shared[:, :, np.append(own, -1)] += w * terms.by_camera
         by_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", terms.pose_point, by_rig)
         pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, by_pose)
-    equations = sum(observed.n_equations for observed in problem.observations)
+    equations = sum(observed.views.n_equations for observed in problem.observations)
     by_shared = by_shared[:, :, np.append(shared, -1)]
     return Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
-
-
-def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDArray[np.intp]:
-    """(T, n) index of the target point in each slot of the batches; -1 for padding."""
-    batches = observed.batches
-    frame = observed.view[batches.view]
-    world = batches.local * problem.scale[frame][:, None, None] + problem.centre[frame][:, :, None]
-    label = target.rows_of(np.swapaxes(world, 1, 2).reshape(-1, 3)).reshape(len(world), -1)
-    return label if batches.whitening is None else np.where(batches.whitening[:, 0] == 0, -1, label)
 
 
 def covariance_of_choice(fit: RigFit) -> Array | None:
@@ -220,7 +212,7 @@ def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
         return None
     estimated, n = fit.problem.estimated_shared, fit.state.columns.n_shared
     blocks = [
-        stretched_blocks(observed.batches, fit.problem.camera(fit.state, side), stretches(world))
+        stretched_blocks(observed.views.batches, fit.problem.camera(fit.state, side), stretches(world))
         for side, observed in enumerate(fit.problem.observations)
     ]
     kept = np.append(np.flatnonzero(estimated), [n, n + 1])
@@ -250,7 +242,7 @@ def covariance_by_given(
                 camera.distortion_model,
                 camera.given_names,
                 camera.given_covariance,
-                seen.pixel_scale,
+                seen.views.pixel_scale,
             )
     if not given.any():
         return None

@@ -102,8 +102,8 @@ def relative_poses(problem: RigProblem, rig: Pose) -> RelativePoses | None:
     if not np.isfinite(solved).all():
         return None
     sides = zip(problem.observations, problem.own_normal, strict=True)
-    counts = [seen.equations_by_view for seen in problem.observations]
-    larger = [own[:, -1, -1] / np.maximum(seen.equations_by_view - 6, 1.0) for seen, own in sides]
+    counts = [seen.views.equations for seen in problem.observations]
+    larger = [own[:, -1, -1] / np.maximum(seen.views.equations - 6, 1.0) for seen, own in sides]
     left, right = problem.paired_left, problem.paired_right
     times = np.maximum(larger[0][left], larger[1][right])
     times = np.where(times > _MUCH_LARGER, times, 1.0)[:, None, None]

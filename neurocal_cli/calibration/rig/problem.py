@@ -28,12 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import Arrowhead
+from neurocal_cli.adjustment.problem import translations
 from neurocal_cli.adjustment.reprojection import (
     POSE,
     camera_columns,
     normal_blocks,
 )
-from neurocal_cli.adjustment.views import PointBatches
+from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -131,23 +132,14 @@ class RigState:
 class Observations:
     """Observations of one camera."""
 
-    batches: PointBatches  # its views in the local coordinates of their frames, with normalised pixels
+    views: Views  # its views, with the world coordinates normalised as those of their frames
     view: NDArray[np.intp]  # (V_c,) frame of each of its views
-    pixel_centre: Array  # (2,) [px]
-    pixel_scale: float  # S1 [px]
-    weight: float  # of a squared normalised residual, (pixel_scale / sigma)^2, so that residuals are whitened
-    n_equations: float  # two for most points; one where a point was measured in one direction only
-
-    @property
-    def equations_by_view(self) -> Array:
-        """(V_c,) number of equations."""
-        counts = self.batches.counts
-        return np.asarray(counts * (self.n_equations / counts.sum()))
+    weight: float  # of a squared normalised residual, (S1 / sigma)^2, so that residuals are whitened
 
     def in_pixels(self, entries: Array) -> Array:
         """(5,) entries of A [px] from normalised ones."""
-        entries = entries * self.pixel_scale
-        entries[3:] += self.pixel_centre
+        entries = entries * self.views.pixel_scale
+        entries[3:] += self.views.pixel_centre
         return entries
 
 
@@ -165,7 +157,6 @@ class RigProblem:
     """Observations of C cameras in V common frames, and the poses in each camera alone."""
 
     calibrations: tuple[Calibration, ...]  # each camera alone
-    names: tuple[tuple[str, ...], ...]  # views of each camera, in the order of its observations
     centre: Array  # (V, 3) world = centre + scale * local
     scale: Array  # (V,)
     unit: float  # of the rig's translations [world unit]
@@ -180,6 +171,11 @@ class RigProblem:
     motion: Motion | None = None  # of the target, if the times of the views are known
     # By camera, that which keeps its distortion monotonic up to the corners of its image.
     penalties: Mapping[int, MonotonicFit] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """Views of each camera, in the order of its observations."""
+        return tuple(observed.views.names for observed in self.observations)
 
     @cached_property
     def together(self) -> NDArray[np.bool_]:
@@ -253,7 +249,6 @@ class RigProblem:
         return replace(
             self.of_frames(np.flatnonzero(kept)),
             calibrations=tuple(self.calibrations[side] for side in sides),
-            names=tuple(self.names[side] for side in sides),
             observations=tuple(replace(observed, view=place[observed.view]) for observed in seen),
             cameras=tuple(self.cameras[side] for side in sides),
             own_normal=tuple(self.own_normal[side] for side in sides),
@@ -333,9 +328,8 @@ class RigProblem:
 
     def world_poses(self, state: RigState, side: int) -> tuple[Array, Array]:
         """(V_c, 3, 3) and (V_c, 3) poses of one camera's views in this camera, in world units."""
-        view, camera = self.observations[side].view, self.camera(state, side)
-        turned = (camera.R @ self.centre[view][..., None])[..., 0]
-        return camera.R, camera.t * self.scale[view][:, None] - turned
+        camera = self.camera(state, side)
+        return camera.R, translations(self.observations[side].views, camera)
 
     def normal(self, state: RigState) -> tuple[Arrowhead, bool]:
         """Normal equations of all unknowns with whitened residuals; the own ones are those of the frames.
@@ -360,7 +354,7 @@ class RigProblem:
     def blocks(self, state: RigState) -> list[tuple[Array, NDArray[np.bool_]]]:
         """`normal_blocks` of each camera."""
         return [
-            normal_blocks(observed.batches, self.camera(state, side))
+            normal_blocks(observed.views.batches, self.camera(state, side))
             for side, observed in enumerate(self.observations)
         ]
 

@@ -18,7 +18,7 @@ from neurocal_cli.adjustment.covariance import (
 )
 from neurocal_cli.adjustment.normal_equations import SchurCovariance, solve_scaled
 from neurocal_cli.adjustment.problem import intrinsic_matrix
-from neurocal_cli.adjustment.reprojection import residuals
+from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
@@ -77,14 +77,11 @@ class RigAssembly:
         """The errors of all points, and the cameras."""
         problem, sums, largest = self.problem, [], []  # of the squared errors [px^2]
         for side, observed in enumerate(problem.observations):
-            batches = observed.batches
-            errors = residuals(batches, problem.camera(self.state, side))
-            squares = (errors**2).sum(axis=1) * observed.pixel_scale**2
-            if batches.whitening is not None:  # those of padding are 0
-                squares = np.where(batches.whitening[:, 0] > 0, squares, 0.0)
-            sums.append(batches.sum_by_view(squares.sum(axis=1)))
+            errors = point_residuals(observed.views, problem.camera(self.state, side))
+            squares = (errors**2).sum(axis=1) * observed.views.pixel_scale**2
+            sums.append(np.add.reduceat(squares, observed.views.first))
             largest.append(float(squares.max()))
-        n_points = sum(observed.batches.counts.sum() for observed in problem.observations)
+        n_points = sum(observed.views.counts.sum() for observed in problem.observations)
         self.rmse_px = float(np.sqrt(sum(part.sum() for part in sums) / n_points))
         self.cameras = [
             self._calibration(side, *errors) for side, errors in enumerate(zip(sums, largest, strict=True))
@@ -126,25 +123,25 @@ class RigAssembly:
 
     def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
         """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
-        given, observed = self.problem.calibrations[side], self.problem.observations[side]
-        intrinsics, batches = intrinsics_of(self.fit, side), observed.batches
+        given, counts = self.problem.calibrations[side], self.problem.observations[side].views.counts
+        intrinsics = intrinsics_of(self.fit, side)
         alone = [camera.stop_reason for camera in self.problem.calibrations if not camera.converged]
         together = StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS
         reason = alone[0] if alone else together.value
         changes: dict[str, Any] = {}
         if self.fit.free[self.columns.cameras[side]].any():
             changes = self._intrinsic_changes(side, intrinsics)
-        rms = np.sqrt(sums / batches.counts)
+        rms = np.sqrt(sums / counts)
         R, t = self.problem.world_poses(self.state, side)
         stds = with_scale(self._pose_stds(side, R), t, self.scale_std)
         R.setflags(write=False)
         t.setflags(write=False)
         views = {
             name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
-                             int(batches.counts[k]), float(rms[k]))
+                             int(counts[k]), float(rms[k]))
             for k, name in enumerate(self.problem.names[side])
         }  # fmt: skip
-        rmse = float(np.sqrt(sums.sum() / batches.counts.sum()))
+        rmse = float(np.sqrt(sums.sum() / counts.sum()))
         return replace(
             given,
             views=views,
@@ -163,7 +160,7 @@ class RigAssembly:
             intrinsics,
             camera.model,
             self._shared_block(self.columns.cameras[side]),
-            self.problem.observations[side].pixel_scale,
+            self.problem.observations[side].views.pixel_scale,
             given.fixed,
             given.square_pixels,
         )

@@ -85,7 +85,7 @@ def pixel_moves(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
     """
     own, by_pose = in_camera(fit, points, side)
     by_camera, by_point = camera_in_pixels(fit, side).project_jacobian(own)
-    by_camera[:, :, :5] *= fit.problem.observations[side].pixel_scale
+    by_camera[:, :, :5] *= fit.problem.observations[side].views.pixel_scale
     if fit.state.cameras[side].square:
         by_camera[:, :, 0] += by_camera[:, :, 2]
     columns = fit.state.columns

@@ -41,8 +41,7 @@ class Board:
         """Axes of the points of all views; None if they do not lie in a common plane."""
         if not views.nearly_flat.all():
             return None
-        world = views.local * np.repeat(views.scale, views.counts)[:, None]
-        world += np.repeat(views.centre, views.counts, axis=0)
+        world = views.world
         centre = world.mean(axis=0)
         axes = np.linalg.eigh((world - centre).T @ (world - centre))[1][:, ::-1]
         if np.abs(axes[:, 2]).max() > 1.0 - _ALONG:  # prints are stretched along the axes that they have

@@ -72,8 +72,7 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
     variance [px^2] is that of the noise.
     """
     views, K = data.views, len(data.names) - 4
-    world = views.local * views.scale[views.index][:, None] + views.centre[views.index]
-    label = target.rows_of(world)
+    label = target.rows_of(views.world)
     prior = prior_of_target(target)
     n = len(target.given)
     state = data.state_of(tables.local, tables.constants)

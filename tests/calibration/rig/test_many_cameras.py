@@ -386,7 +386,7 @@ def test_the_jackknife_over_frames_is_that_of_fits_without_each() -> None:
     arrows = problem.normal(fit.state)[0]
     cameras = [problem.camera(fit.state, side) for side in range(3)]
     blocks = [
-        normal_blocks(seen.batches, camera)[0]
+        normal_blocks(seen.views.batches, camera)[0]
         for seen, camera in zip(problem.observations, cameras, strict=True)
     ]
     views = problem.view_equations(fit.state, blocks)

@@ -235,7 +235,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
         rows.append((moves[0] - moves[1]) / (2 * step))
     J = np.array(rows)
     # Whitened residuals of variance 1 are 1e-5 px, up to what the sample says of it.
-    weight = np.sqrt(np.mean([s.weight / s.pixel_scale**2 for s in problem.observations]))
+    weight = np.sqrt(np.mean([s.weight / s.views.pixel_scale**2 for s in problem.observations]))
     covariance = np.linalg.inv(J @ J.T) * weight**2
     place = np.flatnonzero(np.flatnonzero(free) == columns.rigs[1][3])[0]
     t_x = np.sqrt(covariance[place, place]) * problem.unit
