@@ -196,7 +196,7 @@ def _baseline_error(
             return np.nan
         # A table of known cameras may contain t_z, which the poses replace.
         intrinsic = np.column_stack([local[:, :4], coefficients_of(local, lens.model)])
-        data = PixelData.of(points, False, lens.model, True)
+        data = PixelData(points, False, lens.model, True)
         _, constants = data.linearise(intrinsic, replace(fitted, theta=constants.theta))
     return _rms(_squares(lens, points, local, constants))
 

@@ -81,19 +81,21 @@ class StaticFit:
 class CalibratedSettings:
     """Result of step 1."""
 
-    lens: LensPoints
     data: PixelData
     static: StaticFit
     tables: Tables
     rejected: tuple[RejectedSetting, ...] = ()
 
     @classmethod
-    def of(
-        cls, lens: LensPoints, data: PixelData, static: StaticFit, progress: Progress | None = None
-    ) -> CalibratedSettings:
+    def of(cls, data: PixelData, static: StaticFit, progress: Progress | None = None) -> CalibratedSettings:
         """Calibrations of each setting with common constants."""
-        constants = first_constants(static, lens, data.still)
-        return cls(lens, data, static, common_tables(data, static.local, constants, progress))
+        tables = common_tables(data, static.local, first_constants(static, data), progress)
+        return cls(data, static, tables)
+
+    @property
+    def lens(self) -> LensPoints:
+        """The points and their settings."""
+        return self.data.lens
 
     @property
     def controls(self) -> Array:
@@ -126,8 +128,8 @@ class CalibratedSettings:
             t=self.static.t[views],
             good=self.static.good[keep],
         )
-        data = PixelData.of(rest, self.data.still, self.data.model, self.data.free_theta)
-        return replace(CalibratedSettings.of(rest, data, static, progress), rejected=self.rejected)
+        data = replace(self.data, lens=rest)
+        return replace(CalibratedSettings.of(data, static, progress), rejected=self.rejected)
 
     def with_rejected(self, setting: Array, reason: str) -> CalibratedSettings:
         """The result, which is without a setting (C,), with the reason."""
@@ -182,9 +184,8 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
 
 def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
     """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
-    data = PixelData.of(lens, options.still, model, options.free_theta)
-    static = calibrate_each(lens, data, options.seed, options.free_theta, options.report)
-    start = CalibratedSettings.of(lens, data, static, options.report)
+    data = PixelData(lens, options.still, model, options.free_theta)
+    start = CalibratedSettings.of(data, calibrate_each(data, options.seed, options.report), options.report)
     while True:
         normal = start.tables.normal
         if not normal.sensible or not np.isfinite(normal.cost).all():
@@ -220,13 +221,14 @@ def free_pose_variance(start: CalibratedSettings) -> float:
         return np.nan
     t_z = start.data.names.index("t_z")
     static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
-    free = CalibratedSettings.of(start.lens, replace(start.data, still=False), static)
+    free = CalibratedSettings.of(replace(start.data, still=False), static)
     sensible = free.tables.normal.sensible and np.isfinite(free.variance)
     return free.variance if sensible else np.nan
 
 
-def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
+def calibrate_each(data: PixelData, seed: int, progress: Progress) -> StaticFit:
     """Calibrate each setting alone, from random weights; at least 3 and half of them must succeed."""
+    lens = data.lens
     S, V = lens.n_settings, lens.points.n_views
     local = np.zeros((S, len(data.names)))
     theta, R, t = np.full(S, np.pi / 2), np.tile(np.eye(3), (V, 1, 1)), np.zeros((V, 3))
@@ -236,7 +238,7 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
     for s in range(S):
         progress("calibrating each setting", s / S)
         try:
-            cal = _calibrate(lens.points.select(rows == s), data.model, seed, skew)
+            cal = _calibrate(lens.points.select(rows == s), data.model, seed, data.free_theta)
         except NeurocalError as error:
             reasons[s] = str(error)
             continue
@@ -278,12 +280,12 @@ def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Ca
         return _calibrate(points, "none", seed, skew)
 
 
-def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
+def first_constants(fit: StaticFit, data: PixelData) -> Constants:
     """Starting values of the constants: medians over the settings."""
     theta = float(np.median(fit.theta[fit.good]))
-    if not still:
+    if not data.still:
         return Constants(theta, fit.R, fit.t)
-    views = np.flatnonzero(fit.good[lens.view_setting])
+    views = np.flatnonzero(fit.good[data.setting])
     # The median rotation: the one nearest to all others.
     chords = ((fit.R[views][:, None] - fit.R[views][None]) ** 2).sum(axis=(-2, -1))
     middle = views[int(np.sqrt(chords).sum(axis=1).argmin())]

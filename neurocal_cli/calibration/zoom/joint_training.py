@@ -217,7 +217,7 @@ def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> 
 def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
     """The lens without its errors and warnings."""
     still = start.data.still
-    constants = first_constants(start.static, start.lens, still)
+    constants = first_constants(start.static, start.data)
     averaged = common_tables(start.data, start.tables.local, constants, fixed=True)
 
     def of_lens(constants: Constants) -> Constants:

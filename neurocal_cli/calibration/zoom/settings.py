@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -35,8 +36,8 @@ from neurocal_cli.adjustment.normal_equations import (
     eliminate,
     solve_scaled,
 )
-from neurocal_cli.adjustment.problem import translations, translations_normalised
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.problem import normalised, translations
+from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -233,17 +234,20 @@ def coefficients_of(local: Array, model: str) -> Array:
 class PixelData:
     """Points of all settings, ready for `linearise`."""
 
-    views: Views
-    setting: NDArray[np.int64]  # (V,)
-    n_settings: int
+    lens: LensPoints
     still: bool  # whether neither the camera nor the target moves
     model: str  # of the distortion
     free_theta: bool
 
-    @classmethod
-    def of(cls, lens: LensPoints, still: bool, model: str, free_theta: bool) -> PixelData:
-        """Arrange points."""
-        return cls(arrange(lens.points), lens.view_setting, lens.n_settings, still, model, free_theta)
+    @cached_property
+    def views(self) -> Views:
+        """The points, arranged."""
+        return arrange(self.lens.points)
+
+    @property
+    def setting(self) -> NDArray[np.int64]:
+        """(V,) number of the setting of each view."""
+        return self.lens.view_setting
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -258,9 +262,7 @@ class PixelData:
     @property
     def counts(self) -> NDArray[np.int64]:
         """(S,) points of each setting."""
-        return np.bincount(self.setting, weights=self.views.counts, minlength=self.n_settings).astype(
-            np.int64
-        )
+        return np.bincount(self.lens.point_setting, minlength=self.lens.n_settings)
 
     def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
         """Linearise the reprojection error at local parameters (S, L) and constants.
@@ -274,8 +276,8 @@ class PixelData:
             constants = replace(constants, R=state.R, t=translations(self.views, state))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             N, sensible = normal_blocks(self.views.batches, state)
-            reduced = self._chain(N, local, constants) if self.still else self._eliminate(N, local, constants)
-        summed = np.zeros((self.n_settings, *reduced.shape[1:]))
+            reduced = self._chain(N, local, constants)
+        summed = np.zeros((self.lens.n_settings, *reduced.shape[1:]))
         np.add.at(summed, self.setting, reduced)
         if not self.free_theta:  # a unit diagonal holds it at 0
             theta = len(self.names)
@@ -287,18 +289,16 @@ class PixelData:
 
     def state_of(self, local: Array, constants: Constants) -> CameraState:
         """Normalised cameras of all views."""
-        views, (a, b, u0, v0) = self.views, local[self.setting, :4].T
+        views, local = self.views, local[self.setting]
+        a, b, u0, v0 = local[:, :4].T
         sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
         A = np.column_stack([a, -a * cosine / sine, b / sine, u0, v0])
-        A[:, 3:] -= views.pixel_centre
         if self.still:
             R = np.broadcast_to(constants.R, (views.n_views, 3, 3))
-            t = np.column_stack([np.tile(constants.t, (views.n_views, 1)), local[self.setting, 4]])
+            t = np.column_stack([np.tile(constants.t, (views.n_views, 1)), local[:, 4]])
         else:
             R, t = constants.R, constants.t
-        centred = translations_normalised(views, R, t)
-        k = coefficients_of(local[self.setting], self.model)
-        return CameraState(A / views.pixel_scale, R, centred, self.model, k)
+        return normalised(CameraState(A, R, t, self.model, coefficients_of(local, self.model)), views)
 
     def camera_jacobian(self, local: Array, constants: Constants) -> Array:
         """Derivatives (V, 5 + K, 5 + K) of A's normalised entries and the distortion coefficients.
@@ -317,30 +317,24 @@ class PixelData:
         return J
 
     def _chain(self, N: Array, local: Array, constants: Constants) -> Array:
-        """Normal matrices over local and shared parameters and the residual, for a still camera."""
-        views, V, K = self.views, len(N), N.shape[1] - 12
-        C = np.zeros((V, 12 + K, 12 + K))
-        scale = views.scale[:, None, None]
-        of_camera = np.delete(np.arange(6 + K), 4)  # all local parameters but t_z, and theta
-        C[:, camera_columns(K)[:, None], of_camera] = self.camera_jacobian(local, constants)
-        C[:, 10, 4] = 1 / views.scale
-        # The world turns about its origin, the points of a view about their centre, so t changes too.
-        centre = (constants.R @ views.centre[..., None])[..., 0]
-        C[:, 5:8, 6 + K : 9 + K] = np.eye(3)
-        C[:, 8:11, 6 + K : 9 + K] = -cross_matrix(centre) / scale
-        C[:, 8:10, 9 + K : 11 + K] = np.eye(2) / scale
+        """Normal matrices over local and shared parameters and the residual; moving poses are eliminated."""
+        views, L, columns = self.views, len(self.names), camera_columns(N.shape[1] - 12)
+        of_camera = np.delete(np.arange(L + 1), [4] if self.still else [])  # without t_z, with theta
+        if not self.still:
+            N, _ = eliminate(N, np.append(columns, N.shape[1] - 1), POSE_COLUMNS)
+            columns = np.arange(len(columns))
+        C = np.zeros((len(N), N.shape[1], L + self.n_shared + 1))
+        C[:, columns[:, None], of_camera] = self.camera_jacobian(local, constants)
         C[:, -1, -1] = 1.0
-        return np.swapaxes(C, 1, 2) @ N @ C * self.views.pixel_scale**2
-
-    def _eliminate(self, N: Array, local: Array, constants: Constants) -> Array:
-        """Normal matrices over local parameters, theta and the residual, with the poses eliminated."""
-        V, K = len(N), N.shape[1] - 12
-        keep = np.concatenate([camera_columns(K), [11 + K]])
-        U, _ = eliminate(N, keep, np.arange(POSE.start, POSE.stop))
-        C = np.zeros((V, 6 + K, 6 + K))
-        C[:, :-1, :-1] = self.camera_jacobian(local, constants)
-        C[:, -1, -1] = 1.0
-        return np.swapaxes(C, 1, 2) @ U @ C * self.views.pixel_scale**2
+        if self.still:
+            scale = views.scale[:, None, None]
+            C[:, 10, 4] = 1 / views.scale
+            # The world turns about its origin, the points of a view about their centre, so t changes too.
+            centre = (constants.R @ views.centre[..., None])[..., 0]
+            C[:, 5:8, L + 1 : L + 4] = np.eye(3)
+            C[:, 8:11, L + 1 : L + 4] = -cross_matrix(centre) / scale
+            C[:, 8:10, L + 4 : L + 6] = np.eye(2) / scale
+        return np.swapaxes(C, 1, 2) @ N @ C * views.pixel_scale**2
 
 
 class LocalModel(Protocol):

@@ -79,7 +79,7 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
     jacobian = data.camera_jacobian(tables.local, tables.constants)
     columns = camera_columns(K)
     information = np.zeros((3 * n, 3 * n))
-    coupling = np.zeros((data.n_settings, len(data.names) + data.n_shared, 3 * n))
+    coupling = np.zeros((data.lens.n_settings, len(data.names) + data.n_shared, 3 * n))
     for v in range(views.n_views):
         one = views.subset(np.array([v]))
         camera = state.of_view(v)

@@ -192,7 +192,7 @@ def test_five_values_tell_close_focus() -> None:
 
 def still(bends: bool = False) -> tuple[LensPoints, PixelData]:
     lens = seen("c", grid(4, 3), seed=3, side=4, bends=bends)
-    return lens, PixelData.of(lens, True, "k1" if bends else "none", True)
+    return lens, PixelData(lens, True, "k1" if bends else "none", True)
 
 
 def moving() -> tuple[LensPoints, PixelData]:
@@ -215,12 +215,12 @@ def moving() -> tuple[LensPoints, PixelData]:
             zoom += [10.0 * s] * 20
     points = Correspondences(np.concatenate(world), np.concatenate(pixels), view, (640, 480))
     lens = LensPoints.grouped(points, {"zoom": np.array(zoom)})
-    return lens, PixelData.of(lens, False, "none", True)
+    return lens, PixelData(lens, False, "none", True)
 
 
 def begun(lens: LensPoints, data: PixelData) -> tuple[Array, Constants]:
-    static = calibrate_each(lens, data, 0, True, lambda stage, share: None)
-    tables = common_tables(data, static.local, first_constants(static, lens, data.still))
+    static = calibrate_each(data, 0, lambda stage, share: None)
+    tables = common_tables(data, static.local, first_constants(static, data))
     rng = np.random.default_rng(5)
     return tables.local * (1 + 1e-4 * rng.normal(size=tables.local.shape)), tables.constants
 
@@ -303,8 +303,8 @@ def test_scatter_enters_the_normal_matrices_as_an_offset_that_is_fitted() -> Non
 
 def test_tables_reach_the_truth_within_their_covariance() -> None:
     lens, data = still()
-    static = calibrate_each(lens, data, 0, True, lambda stage, share: None)
-    tables = common_tables(data, static.local, first_constants(static, lens, True))
+    static = calibrate_each(data, 0, lambda stage, share: None)
+    tables = common_tables(data, static.local, first_constants(static, data))
     assert tables.converged
     variance = tables.normal.cost.sum() / (2 * len(lens.points) - 12 * 5 - 6)
     assert np.sqrt(variance) == pytest.approx(0.15, rel=0.1)
@@ -318,8 +318,8 @@ def test_tables_reach_the_truth_within_their_covariance() -> None:
 
 def test_alternating_ends_where_joint_training_ends() -> None:
     lens, data = still()
-    static = calibrate_each(lens, data, 0, True, lambda stage, share: None)
-    tables = common_tables(data, static.local, first_constants(static, lens, True))
+    static = calibrate_each(data, 0, lambda stage, share: None)
+    tables = common_tables(data, static.local, first_constants(static, data))
     x = scaled_controls(lens.settings, lens.settings.min(axis=0), lens.settings.max(axis=0))
     budget = Budget(topologies=((1, 1),), starts=4, best=2, members=1, schedule=Schedule(150, 30, 80))
     rng = np.random.default_rng(0)
