@@ -11,7 +11,7 @@ import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.streams import note, noted, print_summary, say, warn, warned
-from neurocal_cli.errors import FormatError, InputError, UsageError, plural
+from neurocal_cli.errors import InputError, UsageError, plural
 from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
@@ -207,28 +207,17 @@ def _read(
     what: str | None,
 ) -> Correspondences | CameraSet:
     """The points of the files or, if they hold none, the cameras; with values that the files lack."""
-    from neurocal_cli.files.exchange.corners import read_corners
-
-    notes: list[str] = []
-    points = None
-    if what != "camera" and not os.path.isdir(files[0]):
-        points = read_corners(files, board, notes, unit, what)
-    note(*notes)
-    if points is not None:
-        options.note_unused("on points", "distortion")
-        if size is not None and points.image_size not in (None, size):
-            raise InputError("the image size of the file is another; leave out --image-size")
-        return points if size is None else replace(points, image_size=size)
-    if what == "points":
-        raise FormatError("holds no points; leave out --what", files[0])
-    if board is not None:
-        raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
-    if len(files) > 2:
-        raise UsageError(f"there are {len(files)} files; give one, or the two of one rig")
-    from neurocal_cli.files.exchange.reading import read_cameras
+    from neurocal_cli.files.exchange.camera_set import CameraSet
+    from neurocal_cli.files.exchange.reading import read_points_or_cameras
 
     read = warned if size is None else noted  # warnings are about the size
-    return _completed(read(read_cameras, files, distortion=distortion, size=size), unit, size)
+    found = read(read_points_or_cameras, files, board, unit=unit, distortion=distortion, size=size, what=what)
+    if isinstance(found, CameraSet):
+        return _completed(found, unit, size)
+    options.note_unused("on points", "distortion")
+    if size is not None and found.image_size not in (None, size):
+        raise InputError("the image size of the file is another; leave out --image-size")
+    return found if size is None else replace(found, image_size=size)
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:

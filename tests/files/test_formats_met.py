@@ -14,7 +14,8 @@ from test_other_programs import POINT, check, rotated
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.exchange.reading import read_cameras
+from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.reading import read_cameras, read_points_or_cameras
 
 K = [[800.5, 0.0, 321.3], [0.0, 801.25, 238.7], [0.0, 0.0, 1.0]]
 FLAT, COLUMNS = np.ravel(K).tolist(), [entry for column in zip(*K, strict=True) for entry in column]
@@ -712,7 +713,9 @@ def written(content: Any, folder: Path) -> Path:
 @pytest.mark.parametrize("kind", MET)
 def test_a_camera_as_it_is_kept_is_read(kind: str, tmp_path: Path) -> None:
     content, entries, lens, size = MET[kind]
-    found = read_cameras([written(content, tmp_path)], size=(1920, 1080) if kind == "Azure Kinect" else None)
+    size_of = (1920, 1080) if kind == "Azure Kinect" else None
+    found = read_points_or_cameras([written(content, tmp_path)], size=size_of)
+    assert isinstance(found, CameraSet)
     check(found.cameras[0], entries, lens)
     assert found.cameras[0].image_size == size
 
@@ -1024,7 +1027,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
 def test_what_cannot_be_read_is_named(kind: str, tmp_path: Path) -> None:
     content, message = REFUSED[kind]
     with pytest.raises(FormatError) as caught:
-        read_cameras([written(content, tmp_path)])
+        read_points_or_cameras([written(content, tmp_path)])
     assert message in str(caught.value)
     assert str(caught.value).isprintable()
 
@@ -1136,7 +1139,8 @@ def test_a_camera_of_openptv_projects_as_its_formulas(
 ) -> None:
     k1, k2, k3, p1, p2, scale, shear = lens = [-2e-3, 4e-6, 0.0, 1e-5, -2e-5, 1.002, 0.001]
     warnings: list[str] = []
-    found = read_cameras([openptv(tmp_path, centre, lens, 1.0)], warnings=warnings)
+    found = read_points_or_cameras([openptv(tmp_path, centre, lens, 1.0)], warnings=warnings)
+    assert isinstance(found, CameraSet)
     assert [w for w in warnings if "nearest camera" in w] == warnings[:1] if centre[0] else not warnings
     assert found.cameras[0].image_size == S
     world = np.random.default_rng(1).uniform([-110, -60, -40], [60, 90, 40], (200, 3))
@@ -1156,6 +1160,19 @@ def test_a_camera_of_openptv_projects_as_its_formulas(
     (pose,) = found.poses.values()
     got = found.cameras[0].project(pose.to_camera(world))[0]
     assert np.abs(got - pixels)[inside].max() < most
+
+
+def test_the_pixels_of_openptv_are_in_the_runs_of_pyptv_too(tmp_path: Path) -> None:
+    place = openptv(tmp_path, (0.1, 0.0), [0, 0, 0, 0, 0, 1, 0], 1.0)
+    known = read_cameras([place]).cameras[0]
+    (tmp_path / "parameters" / "ptv.par").unlink()
+    run = {"imx": 640, "imy": 480, "pix_x": 0.01, "pix_y": 0.01, "mmp_n1": 1.0, "mmp_n2": 1.0, "mmp_n3": 1.0}
+    (tmp_path / "parameters_Run1.yaml").write_text(json.dumps({"ptv": run}))
+    found = read_cameras([place]).cameras[0]
+    assert (found.intrinsics, found.image_size) == (known.intrinsics, known.image_size)
+    (tmp_path / "parameters_Run2.yaml").write_text(json.dumps({"ptv": {**run, "pix_y": 0.02}}))
+    with pytest.raises(FormatError, match=r"Run1\.yaml, parameters_Run2\.yaml differ in the pixels"):
+        read_cameras([place])
 
 
 def test_the_pose_behind_glass_and_a_lack_of_pixels_are_told(tmp_path: Path) -> None:

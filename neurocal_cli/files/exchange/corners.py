@@ -35,7 +35,13 @@ from neurocal_cli.files.exchange.corner_tables import (
     table_of,
     vnl,
 )
-from neurocal_cli.files.exchange.document import array_of, arrays_of, camera_matrix, few_numbers
+from neurocal_cli.files.exchange.document import (
+    KALIBR_REPORT,
+    array_of,
+    arrays_of,
+    camera_matrix,
+    few_numbers,
+)
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.mat_file import read_variables
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, unit_of
@@ -56,7 +62,6 @@ TABLES = (".csv", ".txt", ".tsv")  # endings of tables of points
 BOARD_ADVICE = "give --board chessboard:COLSxROWS:SQUARE"
 _HEAD = 1_000_000  # characters that show of what kind a file is
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
-_KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
 _NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
 
 
@@ -90,12 +95,8 @@ def read_corners(
     if b"\0" in data or data.startswith(b"\x80"):
         return None
     text = decode(data, source)
-    if _KALIBR.match(text):
-        raise FormatError(
-            "is a report of Kalibr, which holds no points, and Kalibr has no file of corners; give its "
-            "camchain for the cameras, and the images of its bag to neurocal detect for points",
-            source,
-        )
+    if re.match(KALIBR_REPORT[0], text):
+        raise FormatError(KALIBR_REPORT[1], source)
     if _VNL.match(text):
         return vnl(text, source, given)
     if camera_matrix(few_numbers(text)) is not None:

@@ -47,6 +47,12 @@ _MATLAB = re.compile(r"=\s*\[[^\]\n]*;|^[ \t]*%", re.MULTILINE).search
 _MARK = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _HEAD = re.compile(r"\A\s*header:.*?^(?=height:)", re.MULTILINE | re.DOTALL)
 UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
+KALIBR_REPORT = (
+    r"Calibration results\s*\n=+",
+    "is a report of Kalibr, which holds no points, and Kalibr has no file of corners; give its camchain for "
+    "the cameras, and the images of its bag to neurocal detect for points",
+)
+"""How the report of Kalibr begins, which is read neither as points nor as cameras, and what to do."""
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
 _ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)

@@ -21,6 +21,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, mounted
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import PoseKeys
@@ -161,6 +162,7 @@ _ORDER = "place:3 angles:3 R:9 centre:2 f glass:3"
 _LENS = "k1 k2 k3 p1 p2 scale shear"
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _GRID = 15  # rays along each side of the image
+_RUN = ("imx", "imy", "pix_x", "pix_y", "mmp_n1", "mmp_n2", "mmp_n3")
 _PAR = ("ptv.par", "../parameters/ptv.par", "parameters/ptv.par", "../ptv.par")
 
 
@@ -172,19 +174,38 @@ def numbers_in_lines(document: Document) -> list[int]:
 
 def _pixels(path: Path) -> tuple[list[float], bool]:
     """Width and height [px], the sides of a pixel [mm], and whether rays are broken at glass."""
-    for place in _PAR:
-        if (path.parent / place).exists():
-            text, source = read_text(path.parent / place)
-            words = text.split()
-            rest = words[1 + 2 * int(words[0]) :] if words and words[0].isdecimal() else []
-            values = Field(rest[3:11], source, "the lines from imx on").array(8).tolist()
-            if min(values[:4]) <= 0 or any(side % 1 for side in values[:2]):
-                raise FormatError("the size of the images or of the pixels is none; correct it", source)
-            return values[:4], len(set(values[5:8])) > 1
-    raise InputError(
-        "is an orientation of OpenPTV, in mm of the sensor; put ptv.par, which has the size of the pixels, "
-        f"beside it, or give it in its folder cal beside {_PAR[1][3:]}"
-    )
+    folder = path.parent
+    runs = sorted([*folder.glob("parameters*.yaml"), *folder.parent.glob("parameters*.yaml")])  # of pyptv
+    par = next((folder / place for place in _PAR if (folder / place).exists()), None)
+    found = {tuple(_of_run(run)) for run in runs} if par is None else {tuple(_of_par(par))}
+    if not found:
+        raise InputError(
+            "is an orientation of OpenPTV, in mm of the sensor; put ptv.par, which has the size of the "
+            f"pixels, beside it, or give it in its folder cal beside {_PAR[1][3:]} or parameters_Run1.yaml"
+        )
+    if len(found) > 1:
+        raise InputError(
+            f"{', '.join(run.name for run in runs)} differ in the pixels; leave the right one there"
+        )
+    (values,) = found
+    if min(values[:4]) <= 0 or any(side % 1 for side in values[:2]):
+        raise FormatError("the size of the images or of the pixels is none; correct it", str(par or runs[0]))
+    return list(values[:4]), len(set(values[4:])) > 1
+
+
+def _of_par(place: Path) -> list[float]:
+    """Width, height, sides of a pixel and three refractive indices of ``ptv.par``."""
+    text, source = read_text(place)
+    words = text.split()
+    rest = words[1 + 2 * int(words[0]) :] if words and words[0].isdecimal() else []
+    values: list[float] = Field(rest[3:11], source, "the lines from imx on").array(8).tolist()
+    return values[:4] + values[5:]
+
+
+def _of_run(place: Path) -> list[float]:
+    """The same of a run of pyptv."""
+    ptv = parse_tree(*read_text(place))["ptv"]
+    return [ptv[name].number() for name in _RUN]
 
 
 def _read(document: Document) -> CameraSet:
@@ -270,7 +291,7 @@ OPENPTV = Format(
     ("none", "plumb_bob"),
     matches=lambda document: numbers_in_lines(document) == _ORIENTATION,
     read=_read,
-    files=".ori with its .addpar, and ptv.par beside it or in ../parameters",
+    files=".ori with its .addpar; ptv.par beside it or in ../parameters, or a run of pyptv",
     skew=True,
     first_pixel=0.5,
 )

@@ -12,7 +12,15 @@ from neurocal_cli.calibration.presented import Converted
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.nearest_camera import with_model
-from neurocal_cli.errors import FormatError, InputError, check_choice, value_failures
+from neurocal_cli.errors import (
+    FormatError,
+    InputError,
+    NeurocalError,
+    UsageError,
+    check_choice,
+    source_of,
+    value_failures,
+)
 from neurocal_cli.files.exchange import (
     calibrators,
     capture,
@@ -29,8 +37,11 @@ from neurocal_cli.files.exchange import (
     sensors,
 )
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, adapt_cameras, after, inverse
-from neurocal_cli.files.exchange.document import UNKNOWN, Document, NoCameraError
+from neurocal_cli.files.exchange.corners import read_corners
+from neurocal_cli.files.exchange.document import KALIBR_REPORT, UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.neurocal import camera_set
+from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.points import Correspondences
 
 # All tables, the most specific first; the last takes any dictionary of a camera.
 _MODULES = (
@@ -66,7 +77,7 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         b"SQLite format 3",
         "is a database; of COLMAP, give the folder of a model with cameras.txt or cameras.bin",
     ),
-    (r"Calibration results\s*\n=+", "is a report of Kalibr; give its camchain for the cameras"),
+    KALIBR_REPORT,
     (
         r"[^\n]*\n?.*<lensdatabase\b",
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
@@ -176,6 +187,60 @@ def _is(document: Document, sign: bytes | str | Callable[[Document], object]) ->
     return sign(document)
 
 
+def read_points_or_cameras(
+    paths: Sequence[str | Path],
+    board: Board | None = None,
+    notes: list[str] | None = None,
+    warnings: list[str] | None = None,
+    *,
+    unit: str | None = None,
+    distortion: str | None = None,
+    size: tuple[int, int] | None = None,
+    what: str | None = None,
+) -> Correspondences | CameraSet:
+    """Read the points of files or, if they hold none, the cameras; see `read_corners` and `read_cameras`.
+
+    `what` is "points" or "camera" for files that hold both. Numbers in rows may be those of a camera as well;
+    so if something is wrong with them as points, they are read as cameras.
+    """
+    told: list[str] = [] if notes is None else notes
+    wrong: FormatError | None = None
+    if what != "camera" and not Path(paths[0]).is_dir():
+        of_points: list[str] = []
+        try:
+            points = read_corners(paths, board, of_points, unit, what)
+            told += of_points
+        except FormatError as error:
+            points, wrong = None, error
+        if points is not None:
+            return points
+        if what == "points":
+            raise wrong or FormatError("holds no points; leave out --what", source_of(paths[0]))
+    known = wrong is None or _is_of_cameras(str(paths[0]))
+    if board is not None:
+        if wrong is not None and not known:
+            raise wrong
+        raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
+    try:
+        cameras = read_cameras(paths, told, warnings, distortion=distortion, size=size)
+    except NeurocalError:
+        if wrong is None or known:
+            raise
+        raise wrong from None
+    if wrong is not None and not known:
+        told.append(f"{wrong.reason}; so it is read as a camera")
+    return cameras
+
+
+def _is_of_cameras(name: str) -> bool:
+    """Whether a file is of a format that holds cameras alone, or of one that is known and refused."""
+    document = Document(name, [], [])
+    with value_failures(document.source):
+        return any(_is(document, sign) for sign, _ in _REFUSED) or any(
+            one.matches is not None and one.matches(document) for one in READ if one is not dictionary.OPENCV
+        )
+
+
 def read_cameras(
     paths: Sequence[str | Path],
     notes: list[str] | None = None,
@@ -207,7 +272,7 @@ def read_cameras(
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
-        raise InputError(f"there are {len(names)} files; give one, or the two of one rig")
+        raise UsageError(f"there are {len(names)} files; give one, or the two of one rig")
     documents = [Document(name, notes, warnings, distortion, size) for name in names]
     if len(documents) == 2 and "-" not in names and (merged := _merged(documents)) is not None:
         documents = [merged]
