@@ -236,8 +236,9 @@ def _is_of_cameras(name: str) -> bool:
     """Whether a file is of a format that holds cameras alone, or of one that is known and refused."""
     document = Document(name, [], [])
     with value_failures(document.source):
+        of_program = READ[: READ.index(dictionary.OPENCV)]  # which takes any dictionary
         return any(_is(document, sign) for sign, _ in _REFUSED) or any(
-            one.matches is not None and one.matches(document) for one in READ if one is not dictionary.OPENCV
+            one.matches is not None and one.matches(document) for one in of_program
         )
 
 
