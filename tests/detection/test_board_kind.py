@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support import no_boards
 from support.marked import errors_of, marked_scene, plane_of, taken
 from support.places import SAMPLES
 from support.real_data import RealFiles
@@ -172,6 +173,21 @@ def test_squares_in_a_grid_are_no_circles(side: int) -> None:
             cv2.rectangle(image, (left, top), (left + side, top + side), (230,), -1)
     for blur in (1.0, 1.5):
         assert seen_circles(cv2.GaussianBlur(image, (0, 0), blur)) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("dice", 20), ("lamps", 3), ("bottles", 4), ("pieces", 33), ("polygons", 13)]
+)
+def test_things_in_rows_are_no_circles(kind: str, seed: int) -> None:
+    assert seen_circles(no_boards.picture(kind, seed)) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", no_boards.KINDS)
+def test_no_board_is_found_where_there_is_none(kind: str) -> None:
+    for seed in range(142, 214):
+        with pytest.raises(NoBoardError):
+            found_board([no_boards.picture(kind, seed)])
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from neurocal_cli.detection.finding import saddles as find_levels
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.links import find_links, find_seeds_3x3, lattice_from_links
-from neurocal_cli.detection.finding.overlaps import largest_second_difference
+from neurocal_cli.detection.finding.overlaps import largest_second_difference, split_at_folds
 from neurocal_cli.detection.finding.saddles import Level, levels_of, refine_saddles
 from neurocal_cli.simulation.rendering import PlaneTruth, ground_truth
 
@@ -342,6 +342,14 @@ def test_noise_of_large_pictures_is_found_in_bands(monkeypatch: pytest.MonkeyPat
     whole = find_levels.Level(image, 1).noise
     monkeypatch.setattr(find_levels, "_LARGE", 0)
     assert find_levels.Level(image, 1).noise == pytest.approx(whole, rel=0.1)
+
+
+def test_a_single_line_of_vertices_has_no_fold() -> None:
+    pixels = np.stack([np.full(6, 100.0), 100.0 + 30 * np.arange(6) + 8 * (np.arange(6) > 2)], axis=-1)[
+        :, None
+    ]
+    line = Lattice(pixels, np.full((6, 1), 90.0), 0)
+    assert [part.seen.shape for part in split_at_folds(line)] == [(6, 1)]
 
 
 def linked_first(level: Level) -> Lattice | None:

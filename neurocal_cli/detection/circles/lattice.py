@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
-from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays, predicted
+from neurocal_cli.detection.circles.appearance import are_circles
+from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
+from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
@@ -204,11 +205,6 @@ _SLANT = 0.35  # least sine of the angle between the steps at the start
 _STARTS = 30  # blobs that are tried as a start
 _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
-# Amplitudes of two and of four periods: at most 0.15 and 0.02 of circles of 6 px and more, blurred by up to
-# 3 px and tilted by up to 65 degrees, and of those moved by half of their radius.
-_LOPSIDED = 0.16, 0.035, np.inf
-_RINGS = np.append(np.linspace(0.3, 1.4, 23), 1.5)  # of the radius, where the light is looked at
-_INSIDE = 2  # the ring of 0.4, within all marks
 _SYMMETRIC = (
     "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
@@ -252,9 +248,9 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
         return None
     placed = _placed(plane, blobs, index[kept], at[kept])
     places = plane.spread(placed.place.astype(float))
-    if lopsided(grey.astype(np.float32), places, placed.centre, placed.area, _LOPSIDED):
+    if not are_circles(grey.astype(np.float32), places, placed.centre, placed.area, described=True):
         raise NoBoardError(
-            "the image shows marks in rows and columns that are not round, and no grid of circles"
+            "the image shows marks in rows and columns, but no circles of one colour on blank paper"
         )
     return placed
 
@@ -446,30 +442,3 @@ def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
     known = np.column_stack([place, np.ones(len(place))])
     axis = np.linalg.lstsq(known, centre, rcond=None)[0][0]
     return float((axis[0] + 1e-3 * axis[1]) / np.hypot(*axis))
-
-
-def lopsided(light: Image, places: Array, centre: Array, area: Array, most: tuple[float, ...]) -> bool:
-    """Whether marks at places (N, 2) of a board are no circles, by the light around their centres.
-
-    Of the light over their contrast, at the distance where it is half-way in the mean, by the angle on the
-    board: long marks have an amplitude of two periods, and squares of four, larger than the `most` of either.
-    The third limit is that of the light's spread within most marks, beyond that around them: keys have signs.
-    """
-    flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
-    steps = predicted(places, places, centre, flattening)[1]
-    radius = np.sqrt(area / (np.pi * np.maximum(np.abs(np.linalg.det(steps)), 1e-9)))
-    angle = 2 * np.pi * np.arange(16) / 16
-    ring = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    levels = interpolate(light, centre[:, None] + _RINGS[:, None, None, None] * (ring @ steps))
-    contrast = np.ptp(np.median(levels, axis=2), axis=0)
-    levels /= np.maximum(contrast, 1.0)[:, None]
-    inside, around = (float(np.median(levels[k].std(axis=1))) for k in (_INSIDE, -1))
-    relative = levels.mean(axis=1)
-    mean, within = relative.mean(axis=1), np.count_nonzero(_RINGS < 1)
-    # A ring may be light in its middle.
-    inner = np.abs(mean[:within] - mean[-1]).argmax()
-    outer = within + np.abs(mean[within:] - mean[inner]).argmax()
-    half = np.abs(mean[inner : outer + 1] - 0.5 * (mean[inner] + mean[outer])).argmin()
-    amplitudes = [float(np.abs((relative[inner + half] * np.exp(1j * n * angle)).mean())) for n in (2, 4)]
-    spread = float(np.sqrt(max(inside**2 - around**2, 0.0)))
-    return any(one > limit for one, limit in zip((*amplitudes, spread), most, strict=True))

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice, lopsided
+from neurocal_cli.detection.circles.appearance import are_circles
+from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.markers.reading import homographies, homography_at
 from neurocal_cli.detection.placement import NoBoardError
@@ -29,10 +30,6 @@ _MOST_CIRCLES = 3000
 _LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses no rows of smaller ones
 # px^2: blurred rectangles and letters of 6 px look the same. Such circles are found if they are described.
 _SMALLEST = 45.0
-_BENT = 0.1  # greatest median of the second differences of centres, over the step
-# The second is at most 0.01 for circles, and 0.015 and more for squares of 8 px (6 px if sharp); the third at
-# most 0.08 for circles, and 0.15 for signs on keys.
-_LOPSIDED = 0.06, 0.012, 0.11
 # Images that show the same full pattern without what is around it, and their least share.
 _AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
@@ -78,13 +75,13 @@ def _seen_in(
         return None
     index = np.array(list(lattice), dtype=np.int64)
     centre = blobs.centre[list(lattice.values())]
-    if _bent(index, centre) > _BENT:
-        return None
     share, seen, places = max((one for basis in BASES for one in _patterns(index @ basis.T)), key=_likelihood)
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    if np.median(area) < _SMALLEST or lopsided(grey.astype(np.float32), places, centre, area, _LOPSIDED):
+    if np.median(area) < _SMALLEST or not are_circles(
+        grey.astype(np.float32), places, centre, area, described=False
+    ):
         return None
     full = share == 1
     return replace(seen, whole=full and _ends_seen(places, centre, area, grey.shape), full=full)
@@ -110,19 +107,6 @@ def _patterns(index: NDArray[np.int64]) -> list[tuple[float, SeenCircles, Array]
         cols, rows = int(((x - r % 2) // 2).max()) + 1, int(r.max()) + 1
         found.append((n / (cols * rows), SeenCircles(cols, rows, True, whole=False), shifted.astype(float)))
     return found
-
-
-def _bent(index: NDArray[np.int64], centre: Array) -> float:
-    """Median of the second differences of the centres along both axes, over the steps."""
-    at = {tuple(one): k for k, one in enumerate(index.tolist())}
-    bent = []
-    for (i, j), k in at.items():
-        for di, dj in ((1, 0), (0, 1)):
-            before, after = at.get((i - di, j - dj)), at.get((i + di, j + dj))
-            if before is not None and after is not None:
-                step = np.hypot(*(centre[after] - centre[before])) / 2
-                bent.append(np.hypot(*(centre[before] + centre[after] - 2 * centre[k])) / max(step, 1e-9))
-    return float(np.median(bent)) if bent else np.inf
 
 
 def _ends_seen(places: Array, centre: Array, area: Array, shape: tuple[int, ...]) -> bool:

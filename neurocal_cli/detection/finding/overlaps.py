@@ -255,7 +255,7 @@ def _sharpest_fold(second: Array, width: float) -> tuple[float, float]:
     square [px].
     """
     rows = len(second)
-    if rows < _LEAST_ROWS:
+    if rows < _LEAST_ROWS or second.shape[1] < 2:
         return 0.0, 0.0
     before, after, far = (np.full_like(second, np.nan) for _ in range(3))
     before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]

@@ -1,0 +1,104 @@
+"""What a grid of circles looks like: marks of one ink at the places of a plane, round, on blank paper.
+
+Pips of dice, keys, lamps, pieces of a game and bottles in a crate stand in rows, too. But a die has an
+outline and a compartment a wall, so the light changes between the marks; signs are in keys; lamps may be off;
+and other marks are long or have corners. The light around all marks is averaged in the coordinates of the
+board, in which circles are circles whatever the tilt. So noise and things before the board matter little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.finding.saddles import Image, interpolate
+from neurocal_cli.detection.markers.lattice import flattening_of, predicted
+
+_RAYS = 16
+_FIRST, _STEP = 0.3, 0.05  # of the radius, from where on the light is looked at on rings
+_INSIDE, _AROUND = 2, 1.5  # the ring of 0.4, within all marks, and the radius up to which a mark ends
+_NEXT = 0.54  # of the distance to the next mark, of the last ring
+_BLUR = 2.5  # standard deviations of the blur from the edge to where the paper is blank
+_SURE = 4.0  # standard deviations of the noise
+_STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second row is shifted
+
+# Greatest deviations from a grid of circles, lights in contrasts. In brackets those of 220 rendered grids of
+# circles of 9 px and more, blurred by up to half of their radius; the second number is for circles that are
+# described, which may be smaller, blurred by a hand as far as they are wide, or holes of rings.
+_OFF = 0.05, 0.1  # of the distance to the next mark: from where those around a mark predict it (0.014)
+_UNEVEN = (
+    0.25,
+    0.25,
+)  # of the logarithm of the contrast from its change over the board (0.04; photographs 0.07)
+_LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
+_CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
+_SIGNED = 0.09, 0.09  # spread of the light within most marks beyond that around them (0.05; keys 0.12)
+_RULED = 0.015, 0.08  # change of the light in the paper between the marks (0.006; gaps between dice 0.025)
+
+
+def are_circles(light: Image, places: Array, centre: Array, area: Array, described: bool) -> bool:
+    """Whether marks (N,) of an area [px^2] at places (N, 2) of a board are circles on blank paper.
+
+    They may deviate more from these if a board of circles is `described`.
+    """
+    flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
+    start, steps = predicted(places, places, centre, flattening, itself=False)
+    side = np.sqrt(np.maximum(np.abs(np.linalg.det(steps)), 1e-9))
+    away = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
+    apart = float(away[away > 0].min())
+    radius = min(float(np.median(np.sqrt(area / np.pi) / side)), 0.5 * apart)
+    off = float(np.median(np.hypot(*(centre - start).T) / side)) / apart
+    if not off <= _OFF[described]:
+        return False
+    # The first angle of each quarter is farthest from the next marks.
+    angle = 2 * np.pi * np.arange(_RAYS) / _RAYS + (0.25 * np.pi if apart < _STAGGERED else 0.0)
+    shares = np.arange(_FIRST, _NEXT * apart / radius, _STEP)
+    rings = radius * shares
+    shift = rings[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    levels = interpolate(light, centre[:, None, None] + shift @ steps[:, None])
+    middle, edge = np.count_nonzero(shares < 1), np.count_nonzero(shares < _AROUND) - 1
+    # A ring may be light in its middle.
+    profile = np.median(levels[..., :: _RAYS // 4].mean(axis=2), axis=0)
+    inner = int(np.abs(profile[:middle] - profile[edge]).argmax())
+    outer = middle + int(np.abs(profile[middle : edge + 1] - profile[inner]).argmax())
+    ring = np.median(levels, axis=2)
+    contrast = ring[:, outer] - ring[:, inner]
+    ground = np.column_stack([np.ones(len(places)), places])
+    amount = np.log(np.maximum(np.abs(contrast), 1.0))
+    uneven = float((amount - ground @ np.linalg.lstsq(ground, amount, rcond=None)[0]).std())
+    levels -= ring[:, inner, None, None]
+    levels /= np.where(np.abs(contrast) < 1, 1.0, contrast)[:, None, None]
+    mean = levels.mean(axis=0)
+    darker = np.flatnonzero(mean[: outer + 1].mean(axis=1) < 0.5)
+    if not len(darker):
+        return False
+    half = int(darker[-1])
+    long, *corners = (np.abs(np.fft.rfft(mean[half])) / _RAYS)[2 : _RAYS // 2].tolist()
+    inside, around = (float(np.median(levels[:, k].std(axis=1))) for k in (_INSIDE, edge))
+    signed = np.sqrt(max(inside**2 - around**2, 0.0))
+    step = abs(profile[outer] - profile[inner])
+    blur = _STEP * radius * step / max(np.sqrt(2 * np.pi) * np.abs(np.diff(profile)).max(), 1e-9)
+    blank = rings[half] + _BLUR * blur
+    paper = (rings > blank) & (rings < apart - blank)
+    at = places[:, None, None] + shift[paper]
+    within = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
+    found = uneven, long, max(corners), signed, _ruled(levels[:, paper], within)
+    limits = _UNEVEN, _LONG, _CORNERED, _SIGNED, _RULED
+    return all(one <= most[described] for one, most in zip(found, limits, strict=True))
+
+
+def _ruled(levels: Array, within: Array) -> float:
+    """Greatest change by the angle of the mean light (N, rings, rays), beyond what noise makes of it.
+
+    Only the light `within` the board counts, and not its slope, nor that all marks are long.
+    """
+    if not levels[0].size:
+        return 0.0
+    count = np.maximum(within.sum(axis=0), 1)
+    mean = np.where(within, levels, 0.0).sum(axis=0) / count
+    # Lines between some of the marks are no noise.
+    noise = np.sqrt(np.median((np.where(within, levels - mean, 0.0) ** 2).sum(axis=0) / count) / count)
+    smooth = np.fft.rfft(mean, axis=1)
+    smooth[:, 3:] = 0
+    away = np.abs(mean - np.fft.irfft(smooth, _RAYS, axis=1))
+    return float((away - _SURE * noise).max(initial=0.0))
