@@ -662,6 +662,7 @@ MET |= {
     ),
     "rows of names": (lines("", "", **FXY, **NAMED).replace(":", ""), E, D5, None),
     "rows of a matrix": (f"K {' '.join(map(str, FLAT))}\nD {' '.join(map(str, D5))}\n", E, D5, None),
+    "OpenCV's matrices named Camera and Distortion": ({"Camera": K, "Distortion": D5}, E, D5, None),
     "a matrix and its coefficients": (
         "".join(f"{' '.join(map(str, row))}\n" for row in [*K, D5]),
         E,
@@ -1015,6 +1016,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "p1 of a fisheye": (
         metashape("fisheye", "<p1>0.1</p1>"),
         "the key 'p1' is not known in Metashape's fisheye",
+    ),
+    "matrices of several cameras": (
+        {"intrinsic_matrices": [K, np.add(K, 1).tolist()], "distortion_coeffs": [D5, D5]},
+        "holds the matrices of 2 cameras, intrinsic_matrices",
     ),
     "four of KWIVER": (
         "800 0 320\n0 801 240\n0 0 1\n1 0 0\n0 1 0\n0 0 1\n0 0 3\n1 2 3 4\n",

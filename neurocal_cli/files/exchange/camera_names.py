@@ -40,7 +40,7 @@ _OTHERS = {
     "camera_matrix": (  # in OpenCV's stereo sample the left camera has M1 and D1
         "k mtx m intrinsicmatrix intrinsicsmatrix cameraintrinsics intrinsics cameraintrinsic intrinsic "
         "camintrinsics cammatrix cammtx cameramtx kmatrix kmat matrix intrinsicmat intrinsicparameters "
-        "calibrationmatrix intrinsicparams camerak cameramat kk m1 cm intrinsicmtx camk camintr"
+        "calibrationmatrix intrinsicparams camerak cameramat kk m1 cm intrinsicmtx camk camintr camera"
     ),
     "distortion_coefficients": (
         "distcoeffs distcoeff distcoefs distcoef distortioncoeffs distortioncoeff distortioncoefs "

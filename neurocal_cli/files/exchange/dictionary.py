@@ -29,7 +29,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, plain, plain_lists
+from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, is_matrix, plain, plain_lists
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.format_table import PoseKeys, table
@@ -317,6 +317,7 @@ def _within(root: Field, notes: list[str]) -> Field:
     for _ in range(_DEEPEST):
         value = root.value
         if isinstance(value, dict):
+            _refuse_stacked(value)
             root = Field({**others, **_sides_apart(value)}, root.source)
             keys = LooseKeys(root)
             if keys.has_camera() or _sides(keys) is not None or any(map(keys.has_camera, "12lr")):
@@ -352,6 +353,18 @@ def _within(root: Field, notes: list[str]) -> Field:
     if not isinstance(root.value, dict):
         raise NoCameraError(UNKNOWN)
     return root
+
+
+def _refuse_stacked(tree: Mapping[str, Any]) -> None:
+    """Raise InputError for the camera matrices of several cameras in one array, without their poses."""
+    for key, value in tree.items():
+        if isinstance(value, list) and len(value) > 1 and all(map(is_matrix, value)):
+            one = plain(str(key)).replace("matrices", "matrix")
+            if {one, one.removesuffix("s")} & set(NAMES["camera_matrix"]):
+                raise InputError(
+                    f"holds the matrices of {len(value)} cameras, {key}, and their relative poses in no form "
+                    "that is known; save one of them, and its coefficients, as a file: the keys K and D"
+                )
 
 
 def _sides_apart(tree: dict[str, Any]) -> dict[str, Any]:
