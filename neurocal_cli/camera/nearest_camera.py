@@ -228,7 +228,9 @@ def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None 
             f"the model {model} covers nearly nothing of this camera's field of view; choose a wide one"
         )
     pixels, rays = pixels[ahead], rays[ahead]
-    found = [_descended(camera, model, start, skew, rays, pixels) for start in _starts(camera, model, rays)]
+    found = [
+        fitted_to_rays(camera, model, start, skew, rays, pixels) for start in _starts(camera, model, rays)
+    ]
     best = min((one for one in found if one is not None), key=lambda one: one[1], default=None)
     if best is None:
         raise InputError(f"no camera of the model {model} is near this one; choose another model")
@@ -287,10 +289,13 @@ def _starts(camera: Camera, model: str, rays: Array) -> list[Array]:
     return starts[:_STARTS]
 
 
-def _descended(
+def fitted_to_rays(
     camera: Camera, model: str, start: Array, skew: bool, rays: Array, pixels: Array
 ) -> tuple[Camera, float] | None:
-    """The nearest camera from a start, and its cost; None if the start cannot project all rays."""
+    """The nearest camera from a start, and its cost; None if the start cannot project all rays.
+
+    `start` are A11, A12, A22, A13, A23 and the coefficients; rays (N, 3) and their pixels (N, 2).
+    """
     from scipy.optimize import least_squares
 
     # The skew is no parameter, but a fixed multiple of A11.

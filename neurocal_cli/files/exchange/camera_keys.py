@@ -20,8 +20,9 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
+from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.exchange.camera_names import have_gap, matrix_of, may_be_distortion
-from neurocal_cli.files.exchange.tree_paths import at, find, numbers, numbers_at, put, split
+from neurocal_cli.files.exchange.tree_paths import at, find, numbers_at, put, split
 from neurocal_cli.files.tree_fields import Field
 
 NOTHING = "-"  # the place of a coefficient that a program does not have
@@ -142,7 +143,7 @@ class CameraKeys:
         lacking = False
         if count and len(lens.places) == 1 < count:
             found = at(root, lens.places[0]) if whole else find(root, lens.places[0])
-            values = np.zeros(0) if found is None else numbers(found)
+            values = np.zeros(0) if found is None else matrix_data(found, -1)
         else:
             fields = {path: find(root, path) for path in lens.places if path != NOTHING}
             stated = any(fields.values())

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration.rig.rectification import rectify
-from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
@@ -238,47 +237,41 @@ def _parts(document: Document) -> dict[str, Field]:
 
 
 def with_sizes_noted(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
-    """The cameras; warnings are appended about the principal points of images of given size."""
-    for camera in found.cameras:
-        _note_size(camera, document)
-    return found
-
-
-def _note_size(camera: Camera, document: Document) -> None:
-    """Append a warning if the principal point is far outside the image, or its sides are exchanged.
+    """The cameras; a warning tells a principal point far outside the image, or sides that are exchanged.
 
     Raises InputError for a focal length that is not in pixels.
     """
-    f, (u0, v0) = camera.intrinsics.alpha_u, camera.A[:2, 2]
-    tiny = camera.image_size is None and 0 < max(u0, v0) < _SENSOR and f < 10 * _SENSOR
-    if tiny or f < (_SHORTEST if camera.image_size is None else _SHORT * camera.image_size[0]):
-        raise InputError(
-            f"the focal length {f:.6g} is not in pixels, but in mm or relative to the image; convert the "
-            "camera matrix to pixels"
+    for camera in found.cameras:
+        f, (u0, v0), size = camera.intrinsics.alpha_u, camera.A[:2, 2], camera.image_size
+        tiny = size is None and 0 < max(u0, v0) < _SENSOR and f < 10 * _SENSOR
+        if tiny or f < (_SHORTEST if size is None else _SHORT * size[0]):
+            raise InputError(
+                f"the focal length {f:.6g} is not in pixels, but in mm or relative to the image; convert the "
+                "camera matrix to pixels"
+            )
+        if size is None:
+            continue
+        w, h = size
+        off, turned = (
+            max(abs(u0 - (a - 1) / 2) / a, abs(v0 - (b - 1) / 2) / b) for a, b in (size, size[::-1])
         )
-    if camera.image_size is None:
-        return
-    width, height = camera.image_size
-
-    def off(w: int, h: int) -> float:
-        return float(max(abs(u0 - (w - 1) / 2) / w, abs(v0 - (h - 1) / 2) / h))
-
-    place = f"{document.source}: the principal point ({u0:.6g}, {v0:.6g})"
-    if off(width, height) > _OFF and off(height, width) < 0.5 * off(width, height):
-        document.warnings.append(
-            f"{place} is far from the middle of an image of {width} x {height}, and near that of {height} x "
-            f"{width}; if the file has height and width, convert it with --image-size {height} {width}"
-        )
-    elif max(abs(u0) / width, abs(v0) / height) < _CORNER:
-        document.warnings.append(
-            f"{place} is in the corner of an image of {width} x {height}; if it is counted from the middle, "
-            "as in photogrammetry, add half of the size"
-        )
-    elif off(width, height) > _OUTSIDE:
-        document.warnings.append(
-            f"{place} is far outside an image of {width} x {height}; check the image size, and whether the "
-            "images were cropped"
-        )
+        doubt = None
+        if off > _OFF and turned < 0.5 * off:
+            doubt = (
+                f"far from the middle of an image of {w} x {h}, and near that of {h} x {w}; if the file has "
+                f"height and width, convert it with --image-size {h} {w}"
+            )
+        elif max(abs(u0) / w, abs(v0) / h) < _CORNER:
+            doubt = (
+                f"in the corner of an image of {w} x {h}; if it is counted from the middle, as in "
+                "photogrammetry, add half of the size"
+            )
+        elif off > _OUTSIDE:
+            doubt = f"far outside an image of {w} x {h}; check its size, and whether the images were cropped"
+        if doubt is not None:
+            place = f"{document.source}: the principal point ({u0:.6g}, {v0:.6g})"
+            document.warnings.append(f"{place} is {doubt}")
+    return found
 
 
 def _posed(root: Field, document: Document) -> dict[str, Field]:

@@ -170,17 +170,12 @@ class LooseKeys:
     lacks = False  # a coefficient, beside others
 
     def _matrix(self, side: str) -> Array:
-        field = self.find("original_matrix", side, is_matrix)
-        if field is None:
-            field = self.find("camera_matrix", side, lambda value: is_matrix(value) or has_entries(value))
-        if field is None and not side and has_entries(self.root.value):
-            field = self.root
-        if field is None:  # a damaged one
-            field = self.find(
-                "camera_matrix",
-                side,
-                lambda v: not isinstance(v, dict) or not {"data", "rows"}.isdisjoint(v),
-            )
+        field = (
+            self.find("original_matrix", side, is_matrix)
+            or self.find("camera_matrix", side, lambda v: is_matrix(v) or has_entries(v))
+            or (self.root if not side and has_entries(self.root.value) else None)
+            or self.find("camera_matrix", side, lambda v: not _is_mapping(v) or "rows" in v)  # a damaged one
+        )
         if field is None:
             keys = ", ".join(str(key)[:30] for key in list(self.root.value)[:6])
             raise NoCameraError(
@@ -233,10 +228,8 @@ class LooseKeys:
             own = four[-2:] if centre is None else flat(centre.value)
             four = [*(2 * flat(focal.value))[:2], *own]
             size = self.image_size()
-            ratio = self.find("aspect_ratio", "", is_numbers)
-            if ratio is None:
-                likely = [name for name in self.names if "aspect" in name or "ratio" in name]
-                ratio = self.find("", "", lambda v: isinstance(v, (int, float)), likely)
+            likely = [name for name in self.names if "aspect" in name or "ratio" in name]
+            ratio = self.find("aspect_ratio", "", lambda v: isinstance(v, (int, float)), likely)
             if len(flat(focal.value)) == 1 and ratio is not None and ratio.number() not in (0, 1):
                 raise InputError(
                     f"has one focal length and {ratio.path}, which programs take as fy / fx or fx / fy; give "

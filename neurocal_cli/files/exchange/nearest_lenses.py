@@ -19,9 +19,11 @@ import numpy as np
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.nearest_camera import fitted_to_rays
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
+from neurocal_cli.files.exchange.camera_names import matrix_of
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, mounted
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import PoseKeys
@@ -242,18 +244,14 @@ def _camera(
     middle = 0.5 * np.array(size) - 0.5
     origin = centre * [1, -1]  # y down
 
-    def intrinsics(entries: Array) -> Intrinsics:
-        a, skew, b, u0, v0 = entries
-        return Intrinsics.from_matrix(np.array([[a, skew, u0], [0.0, b, v0], [0.0, 0.0, 1.0]]))
-
     start = np.array([*(f * affine).ravel()[[0, 1, 3]], *(affine @ origin + middle)])
     k = np.array([k1 * f**2, k2 * f**4, -p2 * f, p1 * f, k3 * f**6])
-    exact = Camera(intrinsics(start), Distortion("plumb_bob", k) if k.any() else Distortion(), size, name)
+    a, skew, b, u0, v0 = start
+    A = Intrinsics.from_matrix(matrix_of(a, b, u0, v0, skew))
+    exact = Camera(A, Distortion("plumb_bob", k) if k.any() else Distortion(), size, name)
     if not (k.any() and origin.any()):
         return exact
     # Pixels of rays by OpenPTV's formula, and the camera of OpenCV's that is nearest to them.
-    from scipy.optimize import least_squares
-
     corner = np.abs(np.linalg.inv(affine)) @ (0.5 * np.array(size))
     grid = np.stack(np.meshgrid(*(np.linspace(-c, c, _GRID) for c in corner)), axis=-1).reshape(-1, 2)
     x, y = grid.T
@@ -266,15 +264,9 @@ def _camera(
     pixels = np.array(bent).T @ affine.T + middle
     rays = np.column_stack([(grid - origin) / f, np.ones(len(grid))])
 
-    def of(values: Array) -> Camera:
-        return Camera(intrinsics(values[:5]), Distortion("plumb_bob", values[5:]), size, name)
-
-    def errors(values: Array) -> Array:
-        return (np.nan_to_num(of(values).project(rays)[0], nan=1e6) - pixels).ravel()
-
-    unit = np.array([*np.maximum(np.abs(start), 1.0), 0.1, 0.1, 0.01, 0.01, 0.1])
-    found = least_squares(errors, np.array([*start, *k]), x_scale=unit)
-    worst = float(np.hypot(*found.fun.reshape(-1, 2).T).max())
+    found = fitted_to_rays(exact, "plumb_bob", np.array([*start, *k]), True, rays, pixels)
+    near = exact if found is None else found[0]
+    worst = float(np.hypot(*(near.project(rays)[0] - pixels).T).max())
     if worst > _WORST:
         raise InputError(
             f"no camera of OpenCV's is within {_WORST:g} px of this one; calibrate from its points"
@@ -283,7 +275,7 @@ def _camera(
         f"{document.source}: OpenPTV's distortion is about the middle of the sensor; the nearest camera "
         f"about the principal point moves pixels by {worst:.2g} px at most"
     )
-    return of(found.x)
+    return near
 
 
 OPENPTV = Format(

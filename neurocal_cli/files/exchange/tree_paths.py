@@ -62,18 +62,11 @@ def numbers_at(root: Field, path: str) -> Array:
     """Numbers at a path in one row; those of a matrix by its rows."""
     if len(paths := split(path)) > 1:
         return np.array([at(root, one).number() for one in paths])
-    values = numbers(at(root, path))
+    values = matrix_data(at(root, path), -1)
     if path.endswith(_BY_COLUMNS):
         side = {9: 3, 16: 4}.get(len(values), 1)
         values = values.reshape(-1, side).T.ravel()
     return values
-
-
-def numbers(entry: Field, count: int = -1) -> Array:
-    """Numbers in a list, in nested lists or in ``{rows, cols, data}``, in one row."""
-    if isinstance(entry.value, dict) and "rows" not in entry.value:
-        return entry["data"].array(count)
-    return matrix_data(entry, count)
 
 
 def put(tree: dict[str, Any], path: str, value: Any) -> None:
@@ -105,7 +98,7 @@ def in_order(table: str, words: Any, source: str) -> Field:
 
     A table is ``"fx fy R:9 D:"``: single numbers, lists of a length, and perhaps a list of all that follow.
     """
-    values = numbers(Field(words, source)).tolist()
+    values = matrix_data(Field(words, source), -1).tolist()
     tree: dict[str, Any] = {}
     for entry in table.split():
         name, listed, count = entry.partition(":")
