@@ -65,8 +65,8 @@ _OTHERS = {
     ),
     "R": "rstereo stereor rotation rotationmatrix rot",  # of the second camera
     "T": "tstereo stereot translation translationvector trans trns",
-    "rectification_matrix": "r",
-    "projection_matrix": "p",
+    "rectification_matrix": "rectification r",
+    "projection_matrix": "projection p",
 }
 # Of all numbers in one list: fx, fy, cx, cy, and the coefficients.
 _PARAMETERS = "calibration calib cameraparams cameraparameters"

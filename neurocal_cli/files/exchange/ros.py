@@ -26,13 +26,7 @@ from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field, is_number
 
 _TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)  # of ost.txt
-# The lines above the numbers, our keys of these, and how many there are.
 _RECTIFIED = {"rectification_matrix": 9, "projection_matrix": 12}
-_BLOCKS = {
-    "width": ("image_width", 1), "height": ("image_height", 1), "camera matrix": ("camera_matrix", 9),
-    "distortion": ("distortion_coefficients", -1), "rectification": ("rectification_matrix", 9),
-    "projection": ("projection_matrix", 12),
-}  # fmt: skip
 _LABEL = re.compile(r"\s*\[?([A-Za-z][\w /.-]*)\]?\s*").fullmatch
 
 
@@ -81,16 +75,14 @@ def _ost(document: Document) -> Field:
                 name = line
         elif line:
             tree.setdefault(name, []).extend(line.split())
-    root = Field({name: tree[name] for name in _BLOCKS if name in tree}, document.source)
-    read = {key: root[name].array(count).tolist() for name, (key, count) in _BLOCKS.items() if name in root}
-    root["camera matrix"], root["distortion"]
-    rational = len(read["distortion_coefficients"]) > 5
-    own = {
-        "camera_name": tree.get("camera_name", "camera"),
-        "distortion_model": "rational_polynomial" if rational else "plumb_bob",
+    sides = {
+        side: float(tree[side][0]) for side in ("width", "height") if is_number("".join(tree.get(side, [])))
     }
-    sides = {key: int(read.pop(key, [0])[0]) for key in ("image_width", "image_height")}
-    return Field({**own, **sides, **read}, document.source)
+    root = Field({**tree, **sides}, document.source)
+    rational = len(root["distortion"].array(-1)) > 5
+    return Field(
+        {**root.value, "distortion_model": "rational_polynomial" if rational else "plumb_bob"}, root.source
+    )
 
 
 def joined(left: CameraSet, right: CameraSet) -> CameraSet:
