@@ -75,14 +75,11 @@ def _ost(document: Document) -> Field:
                 name = line
         elif line:
             tree.setdefault(name, []).extend(line.split())
-    sides = {
-        side: float(tree[side][0]) for side in ("width", "height") if is_number("".join(tree.get(side, [])))
-    }
-    root = Field({**tree, **sides}, document.source)
+    root = Field(tree, document.source)
+    tree |= {side: root[side].array(1)[0] for side in ("width", "height") if side in root}
     rational = len(root["distortion"].array(-1)) > 5
-    return Field(
-        {**root.value, "distortion_model": "rational_polynomial" if rational else "plumb_bob"}, root.source
-    )
+    tree["distortion_model"] = "rational_polynomial" if rational else "plumb_bob"
+    return root
 
 
 def joined(left: CameraSet, right: CameraSet) -> CameraSet:
