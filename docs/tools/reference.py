@@ -15,8 +15,10 @@ import click
 import neurocal_cli
 from neurocal_cli.commands import neurocal
 from neurocal_cli.files.board_kinds import COUNTED, KINDS, short_form
+from neurocal_cli.files.exchange.corners import KEYS
 from neurocal_cli.files.exchange.reading import FORMATS, READ
 from neurocal_cli.files.other_boards import FORMATS as BOARDS
+from neurocal_cli.files.points_csv import POINTS
 
 DOCS = Path(__file__).resolve().parents[1]
 _MANY_SHARED = 5  # options; fewer are described again
@@ -186,6 +188,7 @@ def _formats_page() -> str:
         "format does not have is refused, with the error of the nearest one in pixels; `--force` writes "
         "that one.",
         "\n".join(models),
+        *_point_parts(),
         *_board_parts(),
         "## What is refused",
         "Four coefficients that may be those of an ordinary lens or of a fisheye, unless the file or "
@@ -199,6 +202,27 @@ def _formats_page() -> str:
         "nearest fisheye, and a warning says by how many pixels it differs.",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _point_parts() -> list[str]:
+    """The columns of tables of points and the names of points in dictionaries, with their synonyms."""
+    rows = ["| column | also called |", "| --- | --- |"]
+    for name, others in POINTS.aliases.items():
+        rows.append(f"| `{name}` | {', '.join(f'`{other}`' for other in others)} |")
+    keys = ["| what | names |", "| --- | --- |"]
+    keys += [
+        f"| {what} | {', '.join(f'`{name}`' for name in names.split())} |" for what, names in KEYS.items()
+    ]
+    return [
+        "## Points",
+        "Tables of points are told by their [columns](files.md#points), of which these may have other names. "
+        "Capitals, blanks and marks do not matter in them, and a unit may follow, as in `X [mm]` or `x_mm`.",
+        "\n".join(rows),
+        "In dictionaries (FileStorage, JSON, `.npz`, `.mat`) points have these names. Files of Bouguet's "
+        "toolbox (`x_1`, `X_1`, ...), mrcal's `corners.vnl`, arrays of NumPy and text files of numbers are "
+        "read as well.",
+        "\n".join(keys),
+    ]
 
 
 def _board_parts() -> list[str]:

@@ -175,6 +175,8 @@ def _parameters(cal: Calibration) -> dict[str, Stated]:
 
 # camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.
 _SAME = 1e-6
+# Rounding leaves 5e-6 in a covariance that is nearly singular.
+_SYMMETRIC = 1e-4
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -274,7 +276,7 @@ def _covariance(field: Field, names: tuple[str, ...], lens: tuple[str, ...]) -> 
     covariance = field["data"].array(len(names), len(names), unknown=True)
     if np.isfinite(covariance).all():
         scaled, _ = unit_diagonal(covariance)
-        symmetric = np.abs(scaled - scaled.T).max() < _SAME
+        symmetric = np.abs(scaled - scaled.T).max() < _SYMMETRIC
         if not symmetric or np.linalg.eigvalsh(scaled).min() < -_SAME:
             field["data"].fail("symmetric, without negative eigenvalues")
     return covariance

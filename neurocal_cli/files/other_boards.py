@@ -13,8 +13,7 @@ from typing import Any, NoReturn
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.files.board_kinds import plane_of
-from neurocal_cli.files.table_header import plain
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.tree_fields import Field, plain
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.markers import DICTIONARIES
 
@@ -120,35 +119,31 @@ _READ: dict[str, Callable[[Field], Any]] = {
 
 def other_board(root: Field) -> Board | None:
     """The board of a file of another program; None if the keys are those of none."""
-    if not isinstance(root.value, dict):
-        return None
-    known = {plain(name): field for name, field in root.entries().items()}
-    told = (one for one in FORMATS if _first(known, one.told)[0] is not None)
+    told = (one for one in FORMATS if _first(root, one.told)[0] is not None)
     if (found := next(told, None)) is not None:
-        return _board(found, known, root)
+        return _board(found, root)
     sections = (other_board(root[name]) for name in _SECTIONS if name in root)
     return next((board for board in sections if board is not None), None)
 
 
 def nearest_board(root: Field) -> str:
     """The program most of whose keys a file has, and what it lacks; "" if none has half of them."""
-    known = {plain(name): field for name, field in root.entries().items()}
     found = [(0.5, "")]
-    for one in FORMATS:
-        for _, table in one.kinds.values():
+    tables = [(one, table) for one in FORMATS for _, table in one.kinds.values()]
+    for part in (root, *(root[name] for name in _SECTIONS if name in root)):
+        for one, table in tables:
             needed = [one.told, *(names for _, optional, names in _keys(table) if not optional)]
-            lacks = [names.split()[0] for names in needed if _first(known, names)[0] is None]
+            lacks = [names.split()[0] for names in needed if _first(part, names)[0] is None]
             said = f"{one.program} is the nearest of the known programs, which has {', '.join(lacks)} as well"
             found.append((1 - len(lacks) / len(needed), said))
     return max(found, key=lambda one: one[0])[1]
 
 
-def _first(known: Mapping[str, Field], names: str) -> tuple[Field | None, str]:
-    """The first field that has one of the names, and the unit that the name tells."""
-    for name in names.split():
-        name, _, unit = name.partition(":")
-        if plain(name) in known:
-            return known[plain(name)], unit
+def _first(root: Field, names: str) -> tuple[Field | None, str]:
+    """The first value that has one of the names, and the unit that the name tells."""
+    for name, _, unit in (word.partition(":") for word in names.split()):
+        if (field := root.called(name)) is not None:
+            return field, unit
     return None, ""
 
 
@@ -159,17 +154,17 @@ def _keys(table: str) -> Iterator[tuple[str, bool, str]]:
         yield said.removesuffix("?"), said.endswith("?"), names
 
 
-def _board(one: BoardFormat, known: Mapping[str, Field], root: Field) -> Board:
+def _board(one: BoardFormat, root: Field) -> Board:
     def lacks(name: str) -> NoReturn:
         root.refuse(f"a board of {one.program} without {name}", "describe the board by --board in short")
 
-    field, _ = _first(known, one.word or one.told.split()[0])
+    field, _ = _first(root, one.word or one.told.split()[0])
     if field is None and not one.word:
         lacks(one.told.split()[0])
     kind, table = _kind(one, field)
     values: dict[str, Any] = {"unit": one.unit}
     for said, optional, names in _keys(table):
-        entry, unit = _first(known, names)
+        entry, unit = _first(root, names)
         empty = (None, "", False) if said == "square" else (None, "")
         if entry is not None and not (optional and entry.value in empty):
             values |= {said: _READ.get(said, Field.number)(entry), **({"unit": unit} if unit else {})}

@@ -13,7 +13,7 @@ from typing import Any
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import UNDISTORTED
 from neurocal_cli.errors import FormatError, InputError, one_line, value_failures
-from neurocal_cli.files.tree_fields import is_number
+from neurocal_cli.files.tree_fields import is_number, plain
 from neurocal_cli.observations.distances import Distance
 
 # 1,5 for 1.5, as spreadsheets write it in many countries.
@@ -194,11 +194,6 @@ def column_names(text: str, schema: Schema) -> tuple[str, ...]:
                 return schema.required if schema.headerless and len(fields) == len(schema.required) else ()
             return () if re.search("[:{<=]", line) else tuple(_renamed(fields, schema)[0])
     return ()
-
-
-def plain(name: str) -> str:
-    """A name in lower-case letters and digits."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def _renamed(names: list[str], schema: Schema) -> tuple[list[str], str | None]:

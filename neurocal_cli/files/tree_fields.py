@@ -18,6 +18,11 @@ T = TypeVar("T")
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
 
+def plain(name: str) -> str:
+    """A name in lower-case letters and digits."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
 class Field:
     """A value in a tree of a file, with its path: the keys from the root, separated by dots."""
 
@@ -62,6 +67,14 @@ class Field:
     def first(self, keys: Iterable[str]) -> Field | None:
         """Value of the first of these keys that is there and not null; None without any."""
         return next((self[key] for key in keys if key in self), None)
+
+    def called(self, names: str) -> Field | None:
+        """Value of the first of these names, without capitals and marks, that is there and not null."""
+        if not isinstance(self.value, dict):
+            return None
+        keys = {plain(key): key for key, value in self.value.items() if value is not None}
+        found = (keys[plain(name)] for name in names.split() if plain(name) in keys)
+        return next((self[key] for key in found), None)
 
     def read(self, key: str, reader: Callable[[Field], T]) -> T | None:
         """Apply a function to the value of a key; None if the key is missing or null."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import random
 import re
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -483,3 +485,18 @@ def test_a_value_of_another_type_anywhere_is_refused_in_one_line(tmp_path_factor
     node[key] = junk
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
     refused_or_read(path, yaml.dump(tree, Dumper=yaml.CSafeDumper, default_flow_style=None))
+
+
+@pytest.mark.parametrize(
+    ("off", "message"), [(1e-5, ""), (1e-3, "neurocal.covariance.data must be symmetric")]
+)
+def test_a_covariance_may_be_off_its_transpose_by_rounding_only(
+    off: float, message: str, tmp_path: Path
+) -> None:
+    cal = made_calibration(3)
+    std = np.array([cal.std[name] for name in INTRINSIC_NAMES])
+    covariance = np.diag(std**2) + np.triu(off * np.outer(std, std), 1)
+    cal = replace(cal, covariance=covariance, covariance_names=INTRINSIC_NAMES)
+    (tmp_path / "c.yaml").write_text(format_calibration(cal))
+    with pytest.raises(FormatError, match=message) if message else nullcontext():
+        assert (read_calibration(tmp_path / "c.yaml").covariance == covariance).all()

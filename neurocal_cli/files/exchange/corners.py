@@ -23,7 +23,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
-from neurocal_cli.files.exchange.camera_names import NAMES, plain
+from neurocal_cli.files.exchange.camera_names import NAMES
 from neurocal_cli.files.exchange.corner_tables import (
     Given,
     Seen,
@@ -46,18 +46,20 @@ from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.mat_file import read_variables
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, unit_of
 from neurocal_cli.files.reading import decode, read_bytes
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.tree_fields import Field, plain
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences
 
-_IMAGE = (
-    "image_points", "imagePoints", "imgpoints", "img_points", "imgPoints", "ImagePoints", "corners",
-    "all_corners",
-)  # fmt: skip
-_WORLD = (
-    "object_points", "objectPoints", "objpoints", "obj_points", "objPoints", "grid_points", "worldPoints",
-    "WorldPoints", "world_points",
-)  # fmt: skip
+# Names of what a dictionary has, and what has a view that stands apart.
+KEYS = {
+    "pixels": "image_points imgpoints img_points corners all_corners",
+    "places": "object_points objpoints obj_points grid_points world_points",
+    "views": "observations views images frames",
+    "pixels of a view": "location_in_image_space points",
+    "places of a view": "location_in_object_space points",
+    "name of a view": "name image image_name file filename snapshot_name",
+}
+_PIXELS = {plain(name) for name in KEYS["pixels"].split()}
 TABLES = (".csv", ".txt", ".tsv")  # endings of tables of points
 BOARD_ADVICE = "give --board chessboard:COLSxROWS:SQUARE"
 _HEAD = 1_000_000  # characters that show of what kind a file is
@@ -107,8 +109,8 @@ def read_corners(
         return of_cells(names, board, notes)
     if has_points(text):
         return table_of(names, given)
-    named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
-    if named or text.lstrip().startswith(("{", "<", "%YAML", "/", "[{", "[\n")):
+    named = {plain(name) for name in re.findall(r"^(\w+)\s*:", text, re.MULTILINE)}
+    if not named.isdisjoint(_PIXELS) or text.lstrip().startswith(("{", "<", "%YAML", "/", "[{", "[\n")):
         return _corners(parse_tree(text, source), given)
     return None
 
@@ -118,7 +120,7 @@ def _corners(root: Field, given: Given, first: float = 0.0, down: bool = False) 
 
     Without board points, `down` tells that the corners run along the columns of the board.
     """
-    field = root.first(_IMAGE) if isinstance(root.value, dict) else None
+    field = root.called(KEYS["pixels"])
     stacked = field is not None and (not isinstance(field.value, dict) or "data" in field)
     apart = [] if stacked else _views_apart(root)
     if not stacked and not apart:
@@ -133,7 +135,7 @@ def _corners(root: Field, given: Given, first: float = 0.0, down: bool = False) 
         names = [f"{k:0{len(str(len(pixels)))}d}" for k in range(1, len(pixels) + 1)]
         if "view_names" in root:
             names = root["view_names"].names(len(pixels))
-        stated = root.first(_WORLD)
+        stated = root.called(KEYS["places"])
         world: list[Array | None] = [None] * len(pixels) if stated is None else list(_stack(stated, 3))
         if len(world) not in (1, len(pixels)):
             field.fail(f"one list of points on the board, or {len(pixels)}")
@@ -159,24 +161,22 @@ def _size(root: Field, pixels: Array) -> tuple[int, int] | None:
 
 def _views_apart(root: Field) -> list[tuple[str, Field, Field | None]]:
     """Name, pixels and board points of each view, where a file has the views apart; none for others."""
-    images = root.first(_IMAGE) if isinstance(root.value, dict) else None
-    if images is not None:  # a mapping of pixels by the names of the views
-        places = root.first(_WORLD)
+    if (images := root.called(KEYS["pixels"])) is not None:  # a mapping of pixels by the names of the views
+        places = root.called(KEYS["places"])
         return [(name, entry, places) for name, entry in images.entries().items()]
     value = root.value
-    for key in ("observations", "views", "images", "frames"):
+    for key in KEYS["views"].split():
         if isinstance(value, dict) and isinstance(value.get(key), (list, dict)):
             root, value = root[key], value[key]
     parts = root.entries().items() if isinstance(value, dict) else enumerate(root.items())
     found = []
     for name, part in parts if isinstance(value, (list, dict)) else ():
-        pixels = (
-            part.first((*_IMAGE, "locationInImageSpace", "points")) if isinstance(part.value, dict) else None
+        pixels, places = (
+            part.called(f"{KEYS[what]} {KEYS[f'{what} of a view']}") for what in ("pixels", "places")
         )
         if pixels is None:
             return []
-        stated = part.first(("name", "image", "image_name", "file", "filename", "snapshotName"))
-        places = part.first((*_WORLD, "locationInObjectSpace", "points"))
+        stated = part.called(KEYS["name of a view"])
         found.append((str(name) if stated is None else stated.text(), pixels, places))
     return found
 
@@ -233,11 +233,13 @@ def _matlab(data: bytes, source: str, given: Given) -> Correspondences | None:
     tree = read_variables(data, source)
     if not given.points and ("fc" in tree or not {*STRUCTS, "K"}.isdisjoint(tree)):
         return None
-    field = next((name for name in _IMAGE if name in tree), None)
+    field = next((name for name in tree if plain(name) in _PIXELS), None)
     if field is None:
         return _bouguet(tree, source, given)
-    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
-    root = Field(plain, source)
+    values = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()
+    }
+    root = Field(values, source)
     if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
         root.value["image_size"] = [int(side) for side in np.ravel(root.value.pop("ImageSize"))[::-1]]
     root.value.setdefault("unit", unit_of(tree))
