@@ -7,7 +7,7 @@ are written out over all points.
 
 `WidePointBatch` is for wide lenses, whose rays may be 90 degrees and more from the axis. The point is
 B (x, y, 1) / w, where the third column of B is the ray of its left pixel: x and y stay small wherever the ray
-points, and w is one over the distance.
+points, and w is one over the distance. The iteration is the same.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from neurocal_cli.camera.monotonic import nearly_undistorted
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 
 _MAX_STEPS = 30
-_HALVINGS = 10  # most of one step
 _SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
 # A rise of the squared error by less, as a factor and in px^2, is rounding.
 _RISE, _ROUNDING = 1 + 1e-9, 1e-18
@@ -66,11 +65,7 @@ class PointBatch:
 
     def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Least-squares points (n, 3), covariances (n, 6), epipolar errors, and which points are behind."""
-        (x, y), right = (
-            nearly_undistorted(camera.distortion, *normalised_points(camera.entries, *pixels))
-            for camera, pixels in zip(self.cameras, self.pixels, strict=True)
-        )
-        w = self._nearest_w(x, y, *right)
+        x, y, w = self._start()
         left_out = ~np.isfinite(x + w)
         x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # any finite values
         N, cost = self._normal(x, y, w)
@@ -80,13 +75,29 @@ class PointBatch:
             if not moved.max(initial=0.0) > _SMALL_STEP:
                 break
             x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
-        points = np.stack([x / w, y / w, 1 / w], axis=1)
-        covariance = _point_covariance(_inverse_entries(N), x, y, w)
-        depth = self._depth(x, y, w)
-        behind = left_out | ~(w > 0) | ~(depth > 0)
+        points, covariance = self._in_space(
+            np.stack([x / w, y / w, 1 / w], axis=1), _point_covariance(_inverse_entries(N), x, y, w)
+        )
+        behind = left_out | ~(w > 0) | ~self._in_front(x, y, w)
         epipolar = np.sqrt(cost)
         points[left_out], covariance[left_out], epipolar[left_out] = np.nan, np.nan, np.nan
         return points, covariance, epipolar, behind
+
+    def _start(self) -> tuple[Array, Array, Array]:
+        """x, y and w near the minimum; not finite where there is none."""
+        (x, y), right = (
+            nearly_undistorted(camera.distortion, *normalised_points(camera.entries, *pixels))
+            for camera, pixels in zip(self.cameras, self.pixels, strict=True)
+        )
+        return x, y, self._nearest_w(x, y, *right)
+
+    def _in_front(self, x: Array, y: Array, w: Array) -> NDArray[np.bool_]:
+        """Which points with positive w the right camera sees."""
+        return np.asarray(self._depth(x, y, w) > 0)
+
+    def _in_space(self, points: Array, covariance: Array) -> tuple[Array, Array]:
+        """Points and covariances in the left camera's frame from those of (x, y, 1) / w."""
+        return points, covariance
 
     def _descend(
         self, state: tuple[Array, Array, Array], step: list[Array], N: list[Array], cost: Array
@@ -242,8 +253,8 @@ def _point_covariance(inverse: list[Array], x: Array, y: Array, w: Array) -> Arr
     )
 
 
-class WidePointBatch:
-    """Some thousand points, from the same as a `PointBatch`."""
+class WidePointBatch(PointBatch):
+    """The same for wide lenses."""
 
     def __init__(
         self,
@@ -253,72 +264,48 @@ class WidePointBatch:
         right: Array,
         whitening: tuple[Array, Array] | None,
     ) -> None:
-        self.cameras, self.pixels = cameras, (left.T, right.T)
+        super().__init__(cameras, rig, left, right, None)
+        self.rows = left.T, right.T
         self.P = np.broadcast_to(np.moveaxis(rig, -1, 0), (left.shape[1], 3, 4))
-        self.R, self.t = self.P[:, :, :3], self.P[:, :, 3]
-        self.whitening = None if whitening is None else tuple(_upper(factors) for factors in whitening)
-        self.left = cameras[0].unproject(self.pixels[0])
-        self.right = cameras[1].unproject(self.pixels[1])
-
-    def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Least-squares points (n, 3), covariances (n, 6), epipolar errors, and which points are behind."""
+        self.turns, self.shifts = self.P[:, :, :3], self.P[:, :, 3]
+        self.factors = None if whitening is None else tuple(_upper(factors) for factors in whitening)
+        self.left, self.right = cameras[0].unproject(self.rows[0]), cameras[1].unproject(self.rows[1])
         lost = ~np.isfinite(self.left[:, 0] + self.right[:, 0])
-        basis = _basis(np.where(lost[:, None], [0.0, 0.0, 1.0], self.left))
-        w = self._nearest_w()
-        lost |= ~np.isfinite(w)
-        q = np.column_stack([np.zeros((len(w), 2)), np.where(lost, 1.0, w)])
-        J, r, seen = self._linearised(basis, q)
-        cost = (r * r).sum(axis=1)
-        for _ in range(_MAX_STEPS):
-            Jt = np.swapaxes(J, 1, 2)
-            step = (_inverse(Jt @ J) @ (Jt @ r[..., None]))[..., 0]
-            # A point whose equations are singular stays where it is.
-            step = np.where(np.isfinite(step).all(axis=1, keepdims=True), step, 0.0)
-            if not np.linalg.norm((J @ step[..., None])[..., 0], axis=1).max(initial=0.0) > _SMALL_STEP:
-                break
-            for _ in range(_HALVINGS):
-                trial = self._linearised(basis, q + step)
-                new = (trial[1] ** 2).sum(axis=1)
-                worse = ~(new <= cost * _RISE + _ROUNDING)
-                if not worse.any():
-                    break
-                step[worse] *= 0.5
-            step[worse] = 0.0
-            q = q + step
-            J, r, seen = self._linearised(basis, q)
-            cost = (r * r).sum(axis=1)
-        w = q[:, 2:]
-        points = self._directions(basis, q) / w
-        # dP = (B (dx, dy, 0) - P dw) / w.
-        by_q = np.concatenate([basis[:, :, :2], -points[:, :, None]], axis=2) / w[:, :, None]
-        spread = by_q @ _inverse(np.swapaxes(J, 1, 2) @ J) @ np.swapaxes(by_q, 1, 2)
+        self.basis = _basis(np.where(lost[:, None], [0.0, 0.0, 1.0], self.left))
+
+    def _start(self) -> tuple[Array, Array, Array]:
+        """On the left ray, at one over the distance whose image is nearest to the right ray."""
+        across = np.cross(self.right, (self.turns @ self.left[..., None])[..., 0])
+        along = np.cross(self.right, self.shifts)
+        w = -(across * along).sum(axis=1) / (along * along).sum(axis=1)
+        return np.zeros_like(w), np.zeros_like(w), w
+
+    def _normal(self, x: Array, y: Array, w: Array) -> tuple[list[Array], Array]:
+        J, r, _ = self._linearised(np.column_stack([x, y, w]))
+        Jt = np.swapaxes(J, 1, 2)
         a, b = np.triu_indices(3)
-        covariance, epipolar = spread[:, a, b], np.sqrt(cost)
-        points[lost], covariance[lost], epipolar[lost] = np.nan, np.nan, np.nan
-        return points, covariance, epipolar, lost | ~(w[:, 0] > 0) | ~seen
+        return [*(Jt @ J)[:, a, b].T, *(Jt @ r[..., None])[..., 0].T], (r * r).sum(axis=1)
 
-    def _nearest_w(self) -> Array:
-        """One over the distance along the left ray whose image is nearest to the right ray."""
-        across = np.cross(self.right, (self.R @ self.left[..., None])[..., 0])
-        along = np.cross(self.right, self.t)
-        return np.asarray(-(across * along).sum(axis=1) / (along * along).sum(axis=1))
+    def _in_front(self, x: Array, y: Array, w: Array) -> NDArray[np.bool_]:
+        return self._linearised(np.column_stack([x, y, w]))[2]
 
-    @staticmethod
-    def _directions(basis: Array, q: Array) -> Array:
-        """B (x, y, 1)."""
-        return np.asarray((basis @ np.column_stack([q[:, :2], np.ones(len(q))])[..., None])[..., 0])
+    def _in_space(self, points: Array, covariance: Array) -> tuple[Array, Array]:
+        whole = covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        a, b = np.triu_indices(3)
+        turned = self.basis @ whole @ np.swapaxes(self.basis, 1, 2)
+        return (self.basis @ points[..., None])[..., 0], turned[:, a, b]
 
-    def _linearised(self, basis: Array, q: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def _linearised(self, q: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Derivatives (n, 4, 3) of both pixels by x, y, w; what is missing (n, 4); and which are seen."""
-        m = self._directions(basis, q)
-        h = (self.R @ m[..., None])[..., 0] + q[:, 2:] * self.t
+        basis, m = self.basis, (self.basis @ np.column_stack([q[:, :2], np.ones(len(q))])[..., None])[..., 0]
+        h = (self.turns @ m[..., None])[..., 0] + q[:, 2:] * self.shifts
         by_left, left, seen_left = self._seen(0, m)
         by_right, right, seen_right = self._seen(1, h)
-        turned = self.R @ basis[:, :, :2]
+        turned = self.turns @ basis[:, :, :2]
         J = np.concatenate(
             [
                 np.concatenate([by_left @ basis[:, :, :2], np.zeros((len(q), 2, 1))], axis=2),
-                by_right @ np.concatenate([turned, self.t[:, :, None]], axis=2),
+                by_right @ np.concatenate([turned, self.shifts[:, :, None]], axis=2),
             ],
             axis=1,
         )
@@ -328,9 +315,9 @@ class WidePointBatch:
         """Derivatives of pixels by points, what is missing to the observed ones, and what is seen."""
         camera = self.cameras[side]
         pixels, seen = camera.project(points)
-        by_point, missing = camera.project_jacobian(points)[1], self.pixels[side] - pixels
-        if self.whitening is not None:
-            factors = self.whitening[side]
+        by_point, missing = camera.project_jacobian(points)[1], self.rows[side] - pixels
+        if self.factors is not None:
+            factors = self.factors[side]
             by_point, missing = factors @ by_point, (factors @ missing[..., None])[..., 0]
         return by_point, missing, seen
 
@@ -341,9 +328,9 @@ class WidePointBatch:
 
     def midpoint(self) -> Array:
         """(n, 3) midpoints of the shortest segments between the rays."""
-        back = np.swapaxes(self.R, 1, 2)
+        back = np.swapaxes(self.turns, 1, 2)
         left, right = self.left, (back @ self.right[..., None])[..., 0]
-        centre = -(back @ self.t[..., None])[..., 0]
+        centre = -(back @ self.shifts[..., None])[..., 0]
         cosine = (left * right).sum(axis=1)
         lc, rc = (left * centre).sum(axis=1), (right * centre).sum(axis=1)
         det = 1.0 - cosine * cosine
@@ -352,7 +339,7 @@ class WidePointBatch:
 
     def compare(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Distances of the points' images from the pixels [px], and which points are behind."""
-        in_right = (self.R @ points[..., None])[..., 0] + self.t
+        in_right = (self.turns @ points[..., None])[..., 0] + self.shifts
         _, left, seen_left = self._seen(0, points)
         _, right, seen_right = self._seen(1, in_right)
         epipolar = np.sqrt((left * left).sum(axis=1) + (right * right).sum(axis=1))
@@ -375,12 +362,6 @@ def _upper(factors: Array) -> Array:
     out = np.zeros((factors.shape[1], 2, 2))
     out[:, 0, 0], out[:, 0, 1], out[:, 1, 1] = factors
     return out
-
-
-def _inverse(N: Array) -> Array:
-    """Inverses (n, 3, 3) of symmetric matrices; not finite where they are singular."""
-    upper = [N[:, j, k] for j in range(3) for k in range(j, 3)]
-    return np.stack(_inverse_entries(upper), axis=1)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
 
 
 def _inverse_entries(N: list[Array]) -> list[Array]:
