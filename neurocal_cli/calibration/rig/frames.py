@@ -88,7 +88,7 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
                 f"the cameras are swapped: the left one's views are {_listed(crossed)}, the right one's "
                 f"{_listed(other)}; give the left camera first"
             )
-        keys = _keys(left, _SIDES[0]), _keys(right, _SIDES[1])
+        keys = _keys(left, _SIDES[0], None), _keys(right, _SIDES[1], None)
     both = tuple((name, keys[1][key]) for key, name in keys[0].items() if key in keys[1])
     if not both:
         raise InputError(
@@ -104,18 +104,22 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     )
 
 
-def _keys(names: Sequence[str], side: re.Pattern[str]) -> dict[str, str]:
-    """Names by their rest without the word for the side; names without such a word are left out."""
+def _keys(names: Sequence[str], words: re.Pattern[str], camera: str | None) -> dict[str, str]:
+    """Names by their rest without the words for the camera.
+
+    Names without such a word are left out of two cameras; of a named one of several cameras they stay.
+    """
     keys: dict[str, str] = {}
     for name in names:
-        key, found = side.subn("", name)
-        key = re.sub(r"[\W_]+", "_", key).strip("_")
-        if not found:
+        key, found = words.subn("", name)
+        if not found and camera is None:
             continue
+        key = re.sub(r"[\W_]+", "_", key).strip("_") or (name if camera else "")
         if key in keys:
+            whose = f"camera {camera}: " if camera else ""
             raise InputError(
-                f"the views {keys[key]!r} and {name!r} are both {key!r} without the name of the camera; give "
-                "views taken together by the two cameras the same name"
+                f"{whose}the views {keys[key]!r} and {name!r} are both {key!r} without the name of the "
+                "camera; give views that were taken together the same name in all cameras"
             )
         keys[key] = name
     return keys
@@ -236,7 +240,7 @@ def match_views(views: Mapping[str, Sequence[str]]) -> FrameNames:
     keys = [list(names) for names in views.values()]
     once = [name for own in keys for name in own]
     if len(set(once)) == len(once) and len(keys) > 1:
-        keys = [_without_camera(camera, names) for camera, names in views.items()]
+        keys = [list(_keys(names, _words(camera), camera)) for camera, names in views.items()]
     place: dict[str, int] = {}
     frames = []
     for own in keys:
@@ -290,20 +294,9 @@ def _of_other_planes(left: Correspondences, right: Correspondences, pairs: ViewP
     return planes[0].isdisjoint(planes[1])
 
 
-def _without_camera(camera: str, names: Sequence[str]) -> list[str]:
-    """The names of one camera's views without the words for the camera."""
-    words = re.compile(rf"(?<![a-z])(?:{re.escape(camera)}(?![0-9])|{_ANY_CAMERA})(?![a-z])", re.IGNORECASE)
-    keys: dict[str, str] = {}
-    for name in names:
-        key = re.sub(r"[\W_]+", "_", words.sub("", name)).strip("_") or name
-        if key in keys:
-            raise InputError(
-                f"camera {camera}: the views {keys[key]!r} and {name!r} are both {key!r} without the name "
-                "of the "
-                "camera; give views that were taken together the same name in all cameras"
-            )
-        keys[key] = name
-    return list(keys)
+def _words(camera: str) -> re.Pattern[str]:
+    """Words for a camera in the names of its views."""
+    return re.compile(rf"(?<![a-z])(?:{re.escape(camera)}(?![0-9])|{_ANY_CAMERA})(?![a-z])", re.IGNORECASE)
 
 
 def check_one_target(points: Mapping[str, Correspondences]) -> None:
@@ -320,8 +313,7 @@ def check_one_target(points: Mapping[str, Correspondences]) -> None:
         if before != name:
             raise InputError(
                 f"cameras {before} and {name} have the same points ({reference.source}, {one.source}); "
-                "give the "
-                "points of each camera once"
+                "give the points of each camera once"
             )
     if any(one.point is None for one in points.values()):
         return
@@ -342,8 +334,7 @@ def check_one_target(points: Mapping[str, Correspondences]) -> None:
     at = [f"({', '.join(f'{x:g}' for x in xyz)})" for xyz in (world, world_before)]
     raise InputError(
         f"{place}: the point {label[:60]!r} is at {at[0]}, but at {at[1]} in the points of camera {other}; "
-        "use one "
-        "board and one unit for all cameras"
+        "use one board and one unit for all cameras"
     )
 
 
@@ -368,6 +359,5 @@ def refuse_apart(names: Sequence[str], linked: NDArray[np.bool_]) -> None:
     told = " | ".join(name_some(names[k] for k in part) for part in parts)
     raise InputError(
         f"these cameras have no view in common with the others: {told}; add views in which a camera of one "
-        "group "
-        "and a camera of another see the board at the same moment, under the same name"
+        "group and a camera of another see the board at the same moment, under the same name"
     )
