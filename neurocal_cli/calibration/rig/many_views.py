@@ -1,9 +1,10 @@
 """Points in space from their pixels in any number of cameras, in the first camera's frame.
 
 Each point has the smallest squared reprojection error over the cameras that saw it, each weighted by the
-noise of its pixels (Gauss-Newton from the point nearest to all rays). If the error of a point seen by three
-cameras or more is too large, one of them may show another point: the camera without which the others agree is
-named, and left out.
+noise of its pixels. Gauss-Newton begins at the point nearest to all rays, which is so near that halved steps
+do for damping: the iteration is not that of `adjustment.levenberg_marquardt`. If the error of a point seen by
+three cameras or more is too large, one of them may show another point: the camera without which the others
+agree is named, and left out.
 """
 
 from __future__ import annotations
