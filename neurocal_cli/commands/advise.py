@@ -46,10 +46,10 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise rig.yaml --next 1
     """  # noqa: D301 - as in the group
     preparation.check((calibration,), plots=(plot,))
-    from neurocal_cli.files.camera_tree import read_tree
+    from neurocal_cli.files.camera_tree import own_kind, read_tree
 
     root = read_tree(calibration)
-    if "stereo" in root or "rig" in root:
+    if own_kind(root) in ("stereo", "rig"):
         _advise_rig(root, count, plot, as_json)
         return
     from neurocal_cli.calibration.advice import advise as weigh

@@ -125,13 +125,13 @@ def _read(name: str) -> Calibration | Camera | Rig:
     """A calibration with its points, a rig, or any camera file; one without covariance is taken as exact."""
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.files.calibration_yaml import calibration_from_field
-    from neurocal_cli.files.camera_tree import read_tree
+    from neurocal_cli.files.camera_tree import own_kind, read_tree
     from neurocal_cli.files.exchange.reading import read_given_camera
     from neurocal_cli.files.rig_yaml import rig_from_field
 
     try:
         root = read_tree(name)
-        if "stereo" in root or "rig" in root:
+        if own_kind(root) in ("stereo", "rig"):
             return rig_from_field(root)
         camera: Calibration | Camera = calibration_from_field(root)
     except FormatError:

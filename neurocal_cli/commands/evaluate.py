@@ -35,7 +35,9 @@ class _Group(options.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args and args[0] not in self.commands and os.path.isfile(args[0]):
-            kind = _kind_of(args[0])
+            from neurocal_cli.files.camera_tree import own_kind, read_tree
+
+            kind = own_kind(read_tree(args[0])) or "camera"
             if kind == "lens":
                 from neurocal_cli.commands.lens import evaluate as lens
 
@@ -44,18 +46,6 @@ class _Group(options.Group):
         elif args and args[0] not in self.commands and {".", os.sep} & set(args[0]):
             raise FormatError("there is no such file; check the path", args[0])
         return super().resolve_command(ctx, args)
-
-
-def _kind_of(file: str) -> str:
-    """The command that judges a file, by the keys of its first lines."""
-    from neurocal_cli.files.camera_tree import read_tree
-
-    root = read_tree(file)
-    if "neurocal_lens" in root:
-        return "lens"
-    if "rig" in root and "stereo" not in root:
-        return "rig"
-    return "stereo" if "stereo" in root else "camera"
 
 
 @click.group(cls=_Group)

@@ -105,18 +105,19 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
     from neurocal_cli.commands.show.html_page import Origin
     from neurocal_cli.commands.show.html_reports import Result, page_of
+    from neurocal_cli.files.camera_tree import own_kind
 
     result: Result
-    if "neurocal_lens" in root:
+    if (kind := own_kind(root)) == "lens":
         from neurocal_cli.files.lens_files import lens_from_field
 
         result, block, cameras, none = lens_from_field(root), None, [], "a zoom lens"
-    elif "stereo" in root:
+    elif kind == "stereo":
         from neurocal_cli.files.rig_yaml import stereo_from_field
 
         result = rig = stereo_from_field(root)
         block, cameras, none = root["left"], [rig.left, rig.right], ""
-    elif "rig" in root and "cameras" in root:
+    elif kind == "rig":
         from neurocal_cli.files.rig_yaml import rig_from_field
 
         result = found = rig_from_field(root)

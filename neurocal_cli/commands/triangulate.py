@@ -216,10 +216,10 @@ def _on_plane(camera: str, pixels: str, view: str, sigma: float | None, as_json:
 
 def _of_many(rig: str, matches: str) -> bool:
     """Whether the rig has other than two cameras, or the matches are those of named cameras."""
+    from neurocal_cli.files.camera_tree import own_kind, read_tree
     from neurocal_cli.files.measurement_csv import has_sightings
-    from neurocal_cli.files.rig_yaml import has_cameras
 
-    return (matches != "-" and has_sightings(matches)) or (rig != "-" and has_cameras(rig))
+    return (matches != "-" and has_sightings(matches)) or (rig != "-" and own_kind(read_tree(rig)) == "rig")
 
 
 def _triangulate_many(

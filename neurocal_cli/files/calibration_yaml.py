@@ -35,7 +35,7 @@ from neurocal_cli.files.calibration_blocks import (
     target_lines,
     view_lines,
 )
-from neurocal_cli.files.camera_tree import camera_info_lines, read_camera_info, read_tree
+from neurocal_cli.files.camera_tree import camera_info_lines, own_kind, read_camera_info, read_tree
 from neurocal_cli.files.key_tables import (
     Keys,
     Kind,
@@ -282,6 +282,18 @@ def _covariance(field: Field, names: tuple[str, ...], lens: tuple[str, ...]) -> 
     return covariance
 
 
+_OTHERS = {
+    "stereo": ("is a stereo rig", "give the file of one camera"),
+    "rig": ("is a rig of several cameras", "give the file of one camera"),
+    "lens": ("is a zoom lens", "give its camera at one setting, from neurocal lens camera"),
+    "camera_info": (
+        "has no neurocal block, so the poses and points are missing",
+        "it can serve as --intrinsics, here give a file that calibrate wrote",
+    ),
+    "": ("has no neurocal block", "give a file that calibrate wrote"),
+}
+
+
 def neurocal_block(root: Field) -> Field:
     """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):
@@ -291,18 +303,7 @@ def neurocal_block(root: Field) -> Field:
         what = "is empty" if root.value is None else "is not a calibration"
         root.refuse(what, "give a file that calibrate wrote")
     if "neurocal" not in root:
-        if "stereo" in root and "left" in root:
-            root.refuse("is a stereo rig", "give the file of one camera")
-        if "rig" in root and "cameras" in root:
-            root.refuse("is a rig of several cameras", "give the file of one camera")
-        if "camera_matrix" in root:
-            root.refuse(
-                "has no neurocal block, so the poses and points are missing",
-                "it can serve as --intrinsics, here give a file that calibrate wrote",
-            )
-        if "neurocal_lens" in root:
-            root.refuse("is a zoom lens", "give its camera at one setting, from neurocal lens camera")
-        root.refuse("has no neurocal block", "give a file that calibrate wrote")
+        root.refuse(*_OTHERS["camera_info" if "camera_matrix" in root else own_kind(root)])
     block = root["neurocal"]
     check_format(block, *FORMATS)
     return block

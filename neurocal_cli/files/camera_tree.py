@@ -53,6 +53,12 @@ def parse_tree(text: str, source: str) -> Field:
     return Field(parse.get(text.lstrip()[:1], parse_yaml)(text, source), source)
 
 
+def own_kind(root: Field) -> str:
+    """What a file of neurocal holds: a ``camera``, a ``stereo`` rig, a ``rig``, a ``lens``; "" for others."""
+    keys = {"neurocal_lens": "lens", "stereo": "stereo", "rig": "rig", "neurocal": "camera"}
+    return next((kind for key, kind in keys.items() if key in root), "")
+
+
 def _parse_json(text: str, source: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_distinct)

@@ -216,12 +216,6 @@ def _edge(rig: Rig, first: str, second: str) -> dict[str, Any]:
     return {"cameras": (first, second), "views": count, "baseline": pair.baseline, "baseline_std": std}
 
 
-def has_cameras(path: str | Path) -> bool:
-    """Whether a file is of a rig of named cameras, and not of a left and a right one."""
-    root = read_tree(path)
-    return "rig" in root and "stereo" not in root
-
-
 def read_rig(path: str | Path) -> Rig:
     """Read a rig of any number of cameras; ``-`` is stdin. The file of a stereo rig has `left` and `right`.
 

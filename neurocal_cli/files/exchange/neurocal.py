@@ -18,6 +18,7 @@ from neurocal_cli.files.calibration_yaml import (
     format_calibration,
     neurocal_block,
 )
+from neurocal_cli.files.camera_tree import own_kind
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.rig_yaml import format_rig, format_stereo_rig, rig_from_field, stereo_from_field
@@ -29,15 +30,9 @@ _UNKNOWN = "unknown"  # unit of lengths if no file states it
 
 def from_tree(root: Field, whole: bool) -> CameraSet:
     """Read a calibration or a rig, with poses and points only if `whole`."""
-    if "neurocal_lens" in root:
-        raise InputError("is a zoom lens; give its camera at one setting, from neurocal lens camera")
-    if "neurocal" not in root:
-        if not whole:
-            kind = "rig" if "rig" in root else "stereo rig"
-            root.refuse(f"is a {kind}; give the file of one camera")
-        if "rig" in root and "stereo" not in root:
-            return camera_set(rig_from_field(root))
-        return camera_set(stereo_from_field(root))
+    kind = own_kind(root)
+    if whole and kind in ("rig", "stereo"):
+        return camera_set(rig_from_field(root) if kind == "rig" else stereo_from_field(root))
     if not whole:
         own = camera_part(root)
         lens = Distortion(own["distortion_model"], own["distortion"])
