@@ -178,10 +178,9 @@ def table(
             poses = [pose.read(part) for part in found.values()]
         elif len(cameras) > 1:
             poses = [STILL, *map(pose.read, list(found.values())[1:])]
-        alone = pose is None or (getattr(pose, "from_first", False) and len(cameras) == 1)
-        alone = alone and views is None
+        placed = pose is not None and not (getattr(pose, "from_first", False) and len(cameras) == 1)
         frame = getattr(pose, "frame", "body")
-        stated = None if alone else unit(next(iter(found.values()))) if callable(unit) else unit
+        stated = unit(next(iter(found.values()))) if callable(unit) else unit if placed else None
         return mounted(cameras, poses, keys.program, stated, frame)
 
     def text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:

@@ -45,6 +45,7 @@ _PARAMETERS = CameraKeys(
     optional="all",
 )
 _SECOND = PoseKeys(("RotationOfCamera2:transposed", "TranslationOfCamera2"), from_first=True)
+_VIEWS, _UNIT = ("RotationMatrices", "TranslationVectors", "ViewNames"), "WorldUnits"
 _PLACES = [path.partition(":")[0] for path in _SECOND.paths]
 _ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
 
@@ -106,13 +107,14 @@ def _parameters(part: Field) -> Field:
 
 
 def _views(root: Field) -> dict[str, Pose]:
-    if "RotationMatrices" not in root or "TranslationVectors" not in root:
+    rotations, translations, views = map(root.get, _VIEWS)
+    if rotations.value is None or translations.value is None:
         return {}
-    R = np.asarray(root["RotationMatrices"].value, dtype=float).reshape(3, 3, -1)
-    t = np.asarray(root["TranslationVectors"].value, dtype=float).reshape(-1, 3)
+    R = np.asarray(rotations.value, dtype=float).reshape(3, 3, -1)
+    t = np.asarray(translations.value, dtype=float).reshape(-1, 3)
     if R.shape[2] != len(t):
-        raise InputError(f"TranslationVectors must be {R.shape[2]} rows; correct it")
-    names = [str(name).strip() for name in root.get("ViewNames", []).value]
+        translations.fail(f"{R.shape[2]} rows")
+    names = [str(name).strip() for name in views.value or ()]
     if len(names) != len(t):
         names = [f"{k}" for k in range(1, len(t) + 1)]
     return {name: Pose(R[:, :, k].T, t[k]) for k, name in enumerate(names)}
@@ -120,7 +122,7 @@ def _views(root: Field) -> dict[str, Pose]:
 
 def unit_of(tree: dict[str, Any]) -> str | None:
     """Unit stated in a struct; None if there is none."""
-    unit = tree.get("WorldUnits")
+    unit = tree.get(_UNIT)
     return {"millimeters": "mm", "centimeters": "cm", "meters": "m", "inches": "in"}.get(
         str(unit), unit if isinstance(unit, str) and unit else None
     )
@@ -128,14 +130,10 @@ def unit_of(tree: dict[str, Any]) -> str | None:
 
 def _whole(trees: list[Tree], cameras: CameraSet) -> Tree:
     for tree in trees:
-        tree["WorldUnits"] = cameras.unit or ""
-    if cameras.poses:
-        poses = list(cameras.poses.values())
-        trees[0] |= {
-            "RotationMatrices": np.stack([pose.R.T for pose in poses], axis=2),
-            "TranslationVectors": np.stack([pose.t for pose in poses]),
-            "ViewNames": np.array(list(cameras.poses), dtype=object),
-        }
+        tree[_UNIT] = cameras.unit or ""
+    if poses := list(cameras.poses.values()):
+        stacks = np.stack([pose.R.T for pose in poses], axis=2), np.stack([pose.t for pose in poses])
+        trees[0] |= zip(_VIEWS, (*stacks, np.array(list(cameras.poses), dtype=object)), strict=True)
     if len(trees) == 1:
         return {STRUCTS[0]: trees[0]}
     placed = {path: trees[1].pop(path) for path in _PLACES}
