@@ -124,7 +124,7 @@ class Format:
     files: str = ""  # its files, for the documentation
     skew: bool = False  # whether its programs support skew
     poses: bool = False  # whether it contains the poses of views
-    most_cameras: int = 2
+    most_cameras: int = 1
     metres: bool = False  # whether lengths are in metres
     needs_size: bool = False  # whether the image size must be known
     rectified: bool = False  # whether it contains the rectification of a camera

@@ -214,7 +214,6 @@ LENSFUN = Format(
     ("none", "k1", "k1k2"),
     _lensfun_text,
     files="database of one lens, XML, written only; with `--focal-length` or `--crop-factor`",
-    most_cameras=1,
     needs_size=True,
     square=True,
 )
