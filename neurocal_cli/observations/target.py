@@ -98,8 +98,8 @@ class Target:
         """Estimated points with the bend of each view removed."""
         if self.bends is None:
             return points
-        world = points.world - self._bend(self.bends, points)
-        return replace(points, world=np.where((self.rows_of(world) >= 0)[:, None], world, points.world))
+        row = self.rows_of(points.world - self._bend(self.bends, points))
+        return replace(points, world=np.where((row >= 0)[:, None], self.found[row], points.world))
 
     def as_given(self, points: Correspondences) -> Correspondences:
         """Points moved back to their given coordinates: the inverse of `seen`."""

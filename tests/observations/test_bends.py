@@ -112,7 +112,7 @@ def test_files_keep_the_bends_and_reproduce_the_error(
 
 def test_damaged_bends_are_refused(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text(format_calibration(found()).replace("saddle", "horse"), "utf-8")
-    with pytest.raises(FormatError, match="a table with view, bowl, saddle, twist"):
+    with pytest.raises(FormatError, match="with view, bowl, saddle, twist among them"):
         read_calibration(tmp_path / "c.yaml")
 
 
