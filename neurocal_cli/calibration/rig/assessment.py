@@ -30,7 +30,7 @@ from neurocal_cli.calibration.rig.space_uncertainty import depth_std, fitted, ha
 from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
-    HELD_OUT,
+    ELSEWHERE,
     SHARE,
     TOLD,
     WORDS,
@@ -332,7 +332,7 @@ def _precision(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     yield SHARE.grade(share), f"the std of {what} is {100 * share:.2g} % of its length", more
     if np.isfinite(e.held_out):
         yield (
-            HELD_OUT.grade(e.held_out),
+            ELSEWHERE.grade(e.held_out),
             f"the cross-validation error is {e.held_out * rig.rmse_px:.3g} px, but the error on all data "
             f"{rig.rmse_px:.3g} px",
             "add frames",

@@ -17,10 +17,12 @@ from neurocal_cli.adjustment.residual_correlation import correlation, effective_
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
     DISPLACED,
     ERROR,
     EXPLAINED,
     LEVEL,
+    TOLD,
     Finding,
     Limit,
     image_diagonal,
@@ -36,12 +38,9 @@ from neurocal_cli.camera.state import CameraState
 
 _AHEAD = 4  # rivals that are tried together with another one
 _MOST = 3  # causes at once
-_MINOR = 0.05  # share of a cause's evidence below which a further one is what its linearisation leaves
-_CURVED = 20.0  # relative error of a linearisation over the size of the cause, which is dimensionless
-_OF_EACH = 0.15  # the same after a cause that each view has in its own way, which may be another motion
-_FAR = 0.25  # the same after a cause that was fitted
-_PART = 0.3  # of the evidence: a good part
-_MUCH = 0.3  # share of the squared error
+_MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
+_FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
+_MUCH = 0.3  # share of the evidence, or of the squared error
 _SHAPED = 0.003  # prior std of stretch and bends over the half length: prints are off by a few thousandths
 _LINEAR = 0.02  # of the focal length: largest difference of two cameras that is not fitted
 
@@ -62,7 +61,7 @@ class Contest:
     def beside_board(self) -> bool:
         """Whether a known cause other than the shape of the target is a good part of the explanation."""
         others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
-        return max(others, default=0.0) > _PART * sum(one.evidence for one in self.causes)
+        return max(others, default=0.0) > _MUCH * sum(one.evidence for one in self.causes)
 
 
 def contest(
@@ -130,10 +129,8 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, rivals, share)
-        # What the linearisation of a few unknowns leaves is of second order.
-        few = chosen[0].weights.size
-        minor = min(_MINOR, (_CURVED * chosen[0].size) ** 2) if few else _OF_EACH
-        least = max(least, (_FAR if fits.get(_key(chosen[0])) else minor) * chosen[0].evidence)
+        far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
+        least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
         for one in chosen:
             causes.append(one)
             alone = one is ranking[0]
@@ -264,23 +261,23 @@ def _steps(lin: Linearised, found: Estimate) -> Array:
     return own + steps
 
 
-_BIASED = Limit(2.0, 5.0)  # std of the focal lengths and the centre by which a cause biases them, or by which
+_BIASED = Limit(
+    TOLD, 5.0
+)  # std of the focal lengths and the centre by which a cause biases them, or by which
 # given values and poses are wrong
-_MOST_GIVEN = 0.75  # share of the squared error that other given values explain, if they are far better
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
-_LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
 
 
 def explains(contest: Contest, contradiction: float, error: float) -> bool:
-    """Whether hardly more than noise remains, or at least half of what is more than noise is explained.
+    """Whether the views hardly contradict each other with the causes, or half of what is more is explained.
 
     `error` is the rms error over the image's diagonal; if it is large, a large one must not remain.
     """
-    if error * np.sqrt(max(1.0 - contest.explained, 0.0)) > ERROR.good < error:
+    left = float(np.sqrt(max(1.0 - contest.explained, 0.0)))
+    if error * left > ERROR.good < error:
         return False
     excess = 1.0 - contradiction**-2
-    left = contradiction * float(np.sqrt(max(1.0 - contest.explained, 0.0)))
-    return not (left > _LEFT and contest.explained < EXPLAINED * excess)
+    return not (contradiction * left > CONTRADICTION.good and contest.explained < EXPLAINED * excess)
 
 
 def findings(contest: Contest, calibration: Calibration, given_told: bool) -> Iterator[Finding]:
@@ -350,7 +347,7 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
     if found.rival.of_given and told.moved_poses > _BIASED.poor:
-        grade = max(grade, 1 + int(found.explained > _MOST_GIVEN))
+        grade = max(grade, 1 + int(found.explained > EXPLAINED))
     # Outliers were left out of the calibration, and what differs from view to view is in the std.
     if contest.of_outliers or not found.weights.size:
         return grade, reason

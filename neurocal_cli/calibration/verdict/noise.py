@@ -14,6 +14,7 @@ from neurocal_cli.adjustment.common_noise import common_share, measured
 from neurocal_cli.calibration.verdict.findings import (
     CORRELATED,
     EXACT,
+    EXPLAINED,
     FEW_POINTS,
     Finding,
     name_some,
@@ -26,7 +27,6 @@ from neurocal_cli.observations.target import Target
 # Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
 _ONE_WAY = 2.5  # rms along u over that along v, or the reverse
 _VIEW = 4.0  # rms of a view over the lower quartile of all views
-_SHARE = 0.5  # common share of the noise from which on the stated sigmas are wrong
 # Points with a sigma below this share of the median one are compared with the others, from so many on.
 _FAR_BELOW, _FEWEST_SMALL = 0.5, 6
 _TAKEN_IN = 1e-2  # share of the error that is left
@@ -76,7 +76,7 @@ def stated_noise(points: Correspondences, residuals: Array, correlation: float) 
     if covariance is None or measured(covariance) or not (residuals**2).sum() > 0:
         return
     advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
-    if common_share(covariance, residuals) < _SHARE:
+    if common_share(covariance, residuals) < EXPLAINED:
         if correlation <= CORRELATED.good:
             yield from _too_small_at_some(np.sqrt(covariance[:, 0]), residuals, advice)
         return

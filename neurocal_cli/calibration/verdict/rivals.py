@@ -7,20 +7,16 @@ views share it (`patterns`), and its words. Ten lines are usual.
 from __future__ import annotations
 
 from neurocal_cli.calibration.verdict import effects, words
-from neurocal_cli.calibration.verdict.findings import DISPLACED, SHARE, Limit
+from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, SHARE, Limit
 from neurocal_cli.calibration.verdict.rival import Rival
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 
-# A result is off by half of a change; careful calibrations state 0.05 %.
-_CHANGED = Limit(0.001, 0.05)  # of the focal length
 # Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 %.
 _OFF = Limit(0.005, 0.05)  # of the focal length
-GIVEN = Limit(0.002, 0.05)
-"""Limits of the change of a given focal length or centre, over the focal length."""
+CHANGED = Limit(0.002, 0.05)
+"""Limits of a change of the focal length or the centre, over the focal length; a result has half of it."""
 SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
 """Advice where it is wrong."""
-_LENS = Limit(0.0002, 0.002)  # of the image's diagonal: 0.16 px and 1.6 px of 640 x 480
-_MOVED = Limit(0.0012, 0.02)  # of the image's diagonal; photographs taken by hand move by up to 0.001
 _BLOCKS = (8, 16)  # sizes of the blocks of video codecs [px]
 _FIXED = "keep zoom and focus fixed, autofocus off, and all images at one size"
 _APART_ADVICE = "calibrate these views and the others separately, and give all images as they were stored"
@@ -38,7 +34,7 @@ RIVALS: tuple[Rival, ...] = (
             "residuals that grow towards the corners in the same way in all views",
             "give --distortion auto, or a model with more coefficients",
             words.too_simple(model),
-            _LENS,
+            DISPLACED,
             effects.common,
             steps=effects.lens(model),
         )
@@ -49,7 +45,7 @@ RIVALS: tuple[Rival, ...] = (
         "the given focal length or centre, moved, takes the residuals away",
         SAME,
         words.wrongly_given,
-        GIVEN,
+        CHANGED,
         effects.common,
         steps=effects.given,
         of_given=True,
@@ -69,7 +65,7 @@ RIVALS: tuple[Rival, ...] = (
         "scaled residuals around the centre, along the sequence, by distance or tilt, or in a group of views",
         _FIXED,
         words.changing("the focal length"),
-        _CHANGED,
+        CHANGED,
         effects.changing,
         steps=effects.focal_length,
     ),
@@ -78,7 +74,7 @@ RIVALS: tuple[Rival, ...] = (
         "scaled residuals around the image's corner, in the same patterns",
         _FIXED,
         words.changing("the size of the image"),
-        _CHANGED,
+        CHANGED,
         effects.changing,
         steps=effects.image_size,
     ),
@@ -95,7 +91,7 @@ RIVALS: tuple[Rival, ...] = (
         "each view asks for a centre of its own",
         "switch image stabilisation off, or expect that predicted pixels are off by as much",
         words.stabilised,
-        _CHANGED,
+        CHANGED,
         steps=effects.centre,
     ),
     *(
@@ -182,7 +178,7 @@ RIVALS: tuple[Rival, ...] = (
             "displacements that grow with the row, in each view others",
             _STILL,
             words.rolling,
-            _MOVED,
+            ERROR,  # photographs taken by hand move by up to 0.001
             effect=effect,
         )
         for effect in (effects.turning, effects.moving)

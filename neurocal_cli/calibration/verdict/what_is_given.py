@@ -43,7 +43,7 @@ from neurocal_cli.calibration.verdict.findings import CONTRADICTION, EXPLAINED, 
 from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import estimates
-from neurocal_cli.calibration.verdict.rivals import GIVEN, RIVALS, SAME
+from neurocal_cli.calibration.verdict.rivals import CHANGED, RIVALS, SAME
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
@@ -120,7 +120,7 @@ def hidden_by_target(
         f"{name} = {old:.5g} is given, but the points give {new:.5g} px"
         for name, old, new in zip(("u0", "v0"), before, after, strict=True)
     )
-    return [(GIVEN.grade(float(np.abs(after - before).max() / calibration.intrinsics.alpha_u)), told, SAME)]
+    return [(CHANGED.grade(float(np.abs(after - before).max() / calibration.intrinsics.alpha_u)), told, SAME)]
 
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.

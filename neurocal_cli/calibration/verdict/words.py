@@ -14,11 +14,7 @@ from neurocal_cli.calibration.verdict.rival import Said, Say, Told
 from neurocal_cli.camera.geometry import Array
 
 _NEAR = 0.02  # of the focal length: equal up to this
-_HALF_SIZE = 0.05  # relative difference between the ratios of two image sizes
 _TURNED = 0.3  # of the distance of two centres: how far their mean may be from the middle of the image
-_AS_MUCH = 0.04  # of the diagonal: a displacement that counts as much as another focal length
-_STRETCHED = 0.004  # relative
-_LINEAR = 0.2  # of the focal length: changes up to this are estimated, if roughly
 DETERMINE = 3
 """Views that determine a camera of their own."""
 _SOME = 0.15  # share of the largest change of a given value from which on others are told, too
@@ -119,12 +115,12 @@ def _alternative(first: Array, second: Array, middle: Array, exchanged: bool) ->
     ratio, near = first / second, _NEAR * second[0]
     if exchanged:
         return "u and v are exchanged in one part"
-    if np.abs(ratio / ratio[0] - 1).max() < min(0.3 * abs(ratio[0] - 1), _HALF_SIZE):
+    if np.abs(ratio / ratio[0] - 1).max() < min(0.3 * abs(ratio[0] - 1), 2 * _NEAR):
         return "are of two sizes"
     zoomed, apart = np.abs(first[:2] - second[:2]).max(), np.abs(first[2:] - second[2:]).max()
     if zoomed < 2 * near and np.abs(0.5 * (first[2:] + second[2:]) - middle).max() < 0.5 * _TURNED * apart:
         return "turned by 180 degrees"
-    if abs(ratio[0] - ratio[1]) > 0.5 * abs(ratio[:2] - 1).max() > _STRETCHED:
+    if abs(ratio[0] - ratio[1]) > 0.5 * abs(ratio[:2] - 1).max() > _NEAR:
         return "their target or their images are stretched in one part"
     if zoomed >= near:
         return "from two zooms"
@@ -144,13 +140,12 @@ def two_targets(told: Told) -> Said:
 
 def odd_view(told: Told) -> Said:
     """One view with another camera."""
-    moved, reason = told.found.amounts * told.alpha, f"{told.members[0]}: it fits another camera or crop"
-    if np.abs(told.found.amounts).max() < _LINEAR:
-        reason += (
-            f": its focal length is {moved[0]:+.2g} px and its centre ({moved[-2]:+.2g}, {moved[-1]:+.2g}) "
-            "px from that of the others"
-        )
-    return reason, told.displaced / told.diagonal
+    moved = told.found.amounts * told.alpha
+    return (
+        f"{told.members[0]}: it fits another camera or crop: its focal length is {moved[0]:+.2g} px and its "
+        f"centre ({moved[-2]:+.2g}, {moved[-1]:+.2g}) px from that of the others",
+        told.displaced / told.diagonal,
+    )
 
 
 def bent(told: Told) -> Said:
@@ -173,7 +168,7 @@ def stretched(told: Told) -> Said:
     if abs(lean) > abs(by):
         shape = f"printed with sides that are {abs(lean):.2g} rad off a right angle"
     reason, size = _on_board(told, shape)
-    wrong = max(abs(by), abs(lean)) > STRETCHED_PRINT
+    wrong = max(abs(by), abs(lean)) > STRETCHED_PRINT.good
     return reason + (f"; {WRONG_PRINT}" if wrong else ""), size
 
 
@@ -225,7 +220,7 @@ def too_simple(model: str) -> Say:
             f"the distortion model is too simple: {model} lowers the error by {100 * (1 - left):.2g} %, "
             f"makes the focal length {100 * abs(longer):.2g} % {'longer' if longer > 0 else 'shorter'}, and "
             f"moves the image centre by {moved:.2g} px",
-            max(told.displaced / told.diagonal, _AS_MUCH * abs(longer)),
+            told.displaced / told.diagonal,
         )
 
     return say

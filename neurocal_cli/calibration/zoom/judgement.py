@@ -17,7 +17,6 @@ from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.verdict.findings import (
     ELSEWHERE,
     ERROR,
-    HELD_OUT,
     LEVEL,
     SHARE,
     Finding,
@@ -125,7 +124,7 @@ def _causes(lens: ZoomLens) -> Iterator[Finding]:
     best = max(evidence for evidence, *_ in found if not np.isnan(evidence))
     for evidence, times, reason, advice in found:
         if evidence > max(LEVEL, best - LEVEL):
-            yield HELD_OUT.grade(times), reason, advice
+            yield ELSEWHERE.grade(times), reason, advice
 
 
 def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Finding]:
