@@ -264,9 +264,8 @@ def changed_camera(drift: Drift | None) -> list[Finding]:
 
 def given_camera(calibration: Calibration, fit: Calibration | None) -> list[Finding]:
     """Findings about the camera from views whose poses were fitted with it."""
-    if fit is None:
-        return []
-    return against_given(gather_evidence(fit).contest, fit)
+    held = None if fit is None else gather_evidence(fit).contest
+    return [] if fit is None or held is None else against_given(held, fit)
 
 
 def with_findings(verdict: Verdict, findings: Sequence[Finding]) -> Verdict:

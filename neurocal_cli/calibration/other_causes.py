@@ -198,11 +198,6 @@ def error_of_view(points: Correspondences, camera: Camera) -> float:
     return _fit(plain, _pose(plain, camera)).rms
 
 
-def may_be_bent(reason: str) -> bool:
-    """Whether a reason of `why_odd` may have the target's shape as its cause."""
-    return "bent" in reason
-
-
 def _or_bent(change: float) -> str:
     """Another cause of a change of this size, over the focal length; "" if it is too large."""
     return ", or the target is bent" if change < _BY_BENDING else ""

@@ -42,7 +42,6 @@ from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_t
 from neurocal_cli.calibration.other_causes import (
     has_other_cause,
     lens_is_too_simple,
-    may_be_bent,
     other_causes,
 )
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
@@ -201,7 +200,7 @@ def _may_contradict_only_given(problem: Problem, solution: Solution, rejected: R
     target, views = solution.target, rejected.views
     if views:
         unexplained = target is None or target.bends is not None
-        return unexplained and all(map(may_be_bent, views.values()))
+        return unexplained and all("bent" in why for why in views.values())
     if not len(rejected) or problem.views.n_views > 1:
         return False
     # A plane that stands elsewhere in the only view; in other views its points would have come back.

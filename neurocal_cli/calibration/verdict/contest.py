@@ -311,15 +311,10 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         yield grade, reason + or_else(names), found.rival.advice
 
 
-def given_camera(contest: Contest | None, calibration: Calibration) -> list[Finding]:
+def given_camera(contest: Contest, calibration: Calibration) -> list[Finding]:
     """What the points say against the camera that was given for them."""
-    if contest is None:
-        return []
-    return [
-        (*_graded(contest, found, calibration), found.rival.advice)
-        for found in contest.causes
-        if found.rival.of_given and not _is_uncertain(found, contest, calibration)
-    ]
+    given = tuple(found for found in contest.causes if found.rival.of_given)
+    return list(findings(replace(contest, causes=given, close=((),) * len(given)), calibration, False))
 
 
 def _is_uncertain(found: Estimate, contest: Contest, calibration: Calibration) -> bool:

@@ -77,8 +77,9 @@ def hidden_by_lens(
         more=(lens,),
     )  # fmt: skip
     # A given value comes first of those that are hardly less probable, also where it is no more than chance.
-    chance = held is None or not held.causes or not held.causes[0].evidence > LEVEL
-    return [] if chance else given_camera(held, calibration)
+    if held is None or not held.causes or not held.causes[0].evidence > LEVEL:
+        return []
+    return given_camera(held, calibration)
 
 
 def hidden_by_target(
