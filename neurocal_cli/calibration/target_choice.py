@@ -40,12 +40,15 @@ from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_in
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
 from neurocal_cli.calibration.other_causes import (
+    contest_of,
     has_other_cause,
     lens_is_too_simple,
     other_causes,
 )
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
+from neurocal_cli.calibration.verdict.effects import bends
+from neurocal_cli.calibration.verdict.words import bend_of
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.network.options import Options
@@ -301,26 +304,15 @@ def _is_where_it_was(found: Found, again: Solution) -> bool:
 
 
 def lines_that_are_bent(solution: Solution, unit: str) -> str:
-    """Warn that a bent board has biased a distortion found from straight lines; empty if it is not bent.
-
-    The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
-    """
-    from neurocal_cli.calibration.lens_choice.plumb_line import MODEL
-
-    problem = solution.problem.with_model(MODEL)
-    adjusted = problem.adjust(solution.adjusted)
-    _, label, _ = distinct_points([problem.points])
-    if not problem.free_poses or not enough_views(label, problem.views.n_views):
+    """Warn that a bent board has biased a distortion found from straight lines; empty if it is not bent."""
+    held = contest_of(solution)
+    first = held.causes[0] if held is not None and held.causes else None
+    if held is None or first is None or first.rival.effect is not bends or first.pattern != "all":
         return ""
-    found = find_target([(problem, adjusted)], least_gain=LEAST_GAIN)
-    if found is None or has_other_cause(replace(solution, problem=problem, adjusted=adjusted), found):
-        return ""
-    target = found.target
-    off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
     return (
-        f"the target is bent by {target.bend():.2g} {unit}, and its points lie {off:.2g} {unit} rms from "
-        "where they are given; its lines are not straight, which biases the distortion estimated from them; "
-        "estimate it from the points instead (--distortion auto)"
+        f"the target is bent by {bend_of(held.lin, first):.2g} {unit}; its lines are not straight, "
+        "which biases the distortion estimated from them; estimate it from the points instead (--distortion "
+        "auto)"
     )
 
 

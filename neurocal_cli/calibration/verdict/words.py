@@ -10,7 +10,8 @@ from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
-from neurocal_cli.calibration.verdict.rival import Said, Say, Told
+from neurocal_cli.calibration.verdict.linearised import Linearised
+from neurocal_cli.calibration.verdict.rival import Estimate, Said, Say, Told
 from neurocal_cli.camera.geometry import Array
 
 _NEAR = 0.02  # of the focal length: equal up to this
@@ -150,11 +151,15 @@ def odd_view(told: Told) -> Said:
 
 def bent(told: Told) -> Said:
     """A common bend."""
-    assert told.lin.board is not None
-    heights = zip(told.found.amounts, BENDS, strict=True)
+    return _on_board(told, f"bent by {bend_of(told.lin, told.found):.2g} {told.unit}")
+
+
+def bend_of(lin: Linearised, found: Estimate) -> float:
+    """Height [world unit] of a common bend between its highest and its lowest point."""
+    assert lin.board is not None
+    heights = zip(found.amounts, BENDS, strict=True)
     terms = [(float(height), i, j) for height, (i, j) in heights]
-    bend = told.lin.board.bend(lambda x, y: np.sum([h * x**i * y**j for h, i, j in terms], axis=0))
-    return _on_board(told, f"bent by {bend:.2g} {told.unit}")
+    return lin.board.bend(lambda x, y: np.sum([h * x**i * y**j for h, i, j in terms], axis=0))
 
 
 def stretched(told: Told) -> Said:
