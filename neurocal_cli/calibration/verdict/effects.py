@@ -147,10 +147,8 @@ def _of_entries(lin: Linearised, *changes: Array) -> Array:
 
 
 _FEWEST = 4  # fewest views that can show a change between them
-_NEARER = 0.1  # least relative range of distances for a change with the distance
-_TURNED = 0.2  # rad; least range of tilts
 _BY_POSE = 6.0  # ways in which poses differ, with which errors of the lens are correlated
-_STARTS, _ROUNDS = 20, 20
+_STARTS = _ROUNDS = 20
 
 
 def common(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
@@ -172,14 +170,12 @@ def changing(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
         return
     yield "line", _ramp(_places(lin).astype(float)), 1.0
     distance = np.linalg.norm(state.t, axis=1) * views.scale
-    if np.ptp(distance) > _NEARER * distance.max():
-        yield "distance", _ramp(1.0 / distance), _BY_POSE
+    yield "distance", _ramp(1.0 / distance), _BY_POSE
     if views.nearly_flat.all():
         normal = (state.R @ views.basis)[:, :, 2]
         normal = normal * -np.sign((normal * state.t).sum(axis=1, keepdims=True))
         for axis, name in enumerate("uv"):
-            if np.ptp(normal[:, axis]) > _TURNED:
-                yield f"tilt along {name}", _ramp(normal[:, axis]), _BY_POSE
+            yield f"tilt along {name}", _ramp(normal[:, axis]), _BY_POSE
     yield from grouped(lin, S, g)
 
 
