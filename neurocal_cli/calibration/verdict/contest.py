@@ -22,7 +22,6 @@ from neurocal_cli.calibration.verdict.findings import (
     ERROR,
     EXPLAINED,
     LEVEL,
-    TOLD,
     Finding,
     Limit,
     image_diagonal,
@@ -261,10 +260,9 @@ def _steps(lin: Linearised, found: Estimate) -> Array:
     return own + steps
 
 
-_BIASED = Limit(
-    TOLD, 5.0
-)  # std of the focal lengths and the centre by which a cause biases them, or by which
-# given values and poses are wrong
+# Std of the focal lengths and the centre by which a cause biases them, or by which given values and poses are
+# wrong.
+_BIASED = Limit(2.0, 5.0)
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
 
 
