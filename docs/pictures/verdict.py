@@ -25,7 +25,7 @@ def main() -> None:
     made = figure(3.7)
     axes = made.subplots()
     names = ("error left out\n/ error on all", "common camera\n/ own cameras", "two halves\ndisagree [std]")
-    limits = (1.3, 1.6, np.sqrt(6.0))
+    limits = (1.5, 1.6, np.sqrt(12.0))
     for number, (title, points) in enumerate(sets.items()):
         found = calibrate(points, distortion="none", outliers="keep")
         verdict = found.verdict
