@@ -39,7 +39,6 @@ _PROMISED = 1.05  # the same for its prediction before the adjustment, which is 
 # residuals count as noise. Ordinary lenses leave 0.04 or less, a narrow bump 0.09.
 _ALIKE, _NOISE = 0.05, 0.15
 _BETWEEN = ("two cameras", "a zoom that moves")  # that a rich lens must not leave
-_MOST = 0.5  # share of the squared error that another cause explains if the lens does not
 
 
 def with_rich_lens(
@@ -72,7 +71,9 @@ def _rich_lens(solution: Solution) -> Solution | None:
     if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
         return None
     repeated = solution.repeated
-    if repeated.n_poses < _FEWEST or _has_other_cause(solution):
+    held = contest_of(solution) if repeated.n_poses >= _FEWEST else None
+    # What differs from view to view may be the lens: other parts of it are seen.
+    if held is None or held.of_all_views:
         return None
     problem = problem.with_points(problem.points if target is None else target.as_given(problem.points))
     fisheye, adjusted = as_fisheye(problem, normalised(solution.in_pixels, problem.views))
@@ -95,17 +96,6 @@ def _rich_lens(solution: Solution) -> Solution | None:
         return None
     rms = float(np.sqrt(lost.sum() / len(views.index))) * views.pixel_scale
     return replace(rich, model_errors={**(solution.model_errors or {}), "rich": rms})
-
-
-def _has_other_cause(solution: Solution) -> bool:
-    """Whether a cause that all views share, such as a cut, explains half of the squared error.
-
-    What differs from view to view may be the lens: other parts of it are seen.
-    """
-    held = contest_of(solution)
-    if held is None or not held.causes or held.explained < _MOST:
-        return False
-    return held.causes[0].pattern == "all" and not held.causes[0].rival.of_board
 
 
 def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:

@@ -42,7 +42,6 @@ from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     EXACT,
-    EXPLAINED,
     SPARE,
     Finding,
     pixel_spread,
@@ -332,12 +331,7 @@ class _AtMinimum:
         start = normalised(self.calibration.state(points.view_names), views)
         state = adjust(views.batches, start, self.free, self.free_poses, _STEPS).state
         held = self._contest_at(views, state)
-        if held is None or not held.causes or held.explained < EXPLAINED:
-            return None
-        first = held.causes[0]
-        if first.pattern != "all" or first.rival.of_board:
-            return None
-        return replace(held, of_outliers=True)
+        return replace(held, of_outliers=True) if held is not None and held.of_all_views else None
 
     def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
         target = self.calibration.target

@@ -57,6 +57,12 @@ class Contest:
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
 
     @property
+    def of_all_views(self) -> bool:
+        """Whether a cause that all views share, but not the target's shape, explains most of the error."""
+        first = self.causes[0] if self.explained >= EXPLAINED else None
+        return first is not None and first.pattern == "all" and not first.rival.of_board
+
+    @property
     def beside_board(self) -> bool:
         """Whether a known cause other than the shape of the target is a good part of the explanation."""
         others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
