@@ -21,8 +21,10 @@ from neurocal_cli.calibration.zoom.mlfn import Topology
 from neurocal_cli.calibration.zoom.parameter_networks import SCALES, LensNets, ParameterNet
 from neurocal_cli.calibration.zoom.settings import CONTROLS, Constants, LensPoints, Normal, Tables, describe
 from neurocal_cli.calibration.zoom.zoom_lens import Member, RejectedSetting, ZoomLens
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion, coefficient_names
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
 from neurocal_cli.files.exchange.reading import read_intrinsics
@@ -242,13 +244,10 @@ def _table(field: Field, S: int, L: int, Q: int) -> Tables:
     return Tables(found["local"], found["constants"], Normal(H, found["g"], found["cost"], True))
 
 
-_PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 _FILES = "camera"
-_CAMERAS = Schema(kind="cameras", required=_PARAMETERS, optional=("t_z", *CONTROLS))
+_CAMERAS = Schema(kind="cameras", required=_CAMERA, optional=("t_z", *CONTROLS))
 _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), labels=frozenset({_FILES}))
 _NESTED = (*POLYNOMIAL_MODELS, "rational")  # each has the coefficients of the one before it, and more
-# Contents of a file: columns of settings, `_PARAMETERS`, theta and perhaps t_z; lenses; image sizes.
-_Rows = tuple[dict[str, Array], list[Distortion], set[tuple[int, int]]]
 
 
 def read_lens_data(
@@ -339,14 +338,15 @@ def _cameras(tables: list[Table], notes: list[str]) -> LensCameras:
     for table in tables:
         table.note_unknown(notes)
     _controls(tables)
-    parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
-    tabled, lenses, stated = zip(*parts, strict=True)
-    sizes = set().union(*stated)
-    if len(sizes) > 1:
+    cameras = [camera for table in tables for camera in _in_rows(table)]
+    sizes = {one.image_size for one in cameras} | {table.metadata.image_size for table in tables}
+    if len(sizes := sizes - {None}) > 1:
         raise InputError(f"{tables[0].source}: the cameras differ in image_size; give cameras of one lens")
-    model, coefficients = _common_model([lens for part in lenses for lens in part], tables[0].source)
-    shared = [name for name in tabled[0] if all(name in part for part in tabled)]
-    columns = {name: np.concatenate([part[name] for part in tabled]) for name in shared}
+    model, coefficients = _common_model([camera.distortion for camera in cameras], tables[0].source)
+    shared = [name for name in ("t_z", *CONTROLS) if all(name in table.numbers for table in tables)]
+    columns = {name: np.concatenate([table.numbers[name] for table in tables]) for name in shared}
+    for name in (*_CAMERA, "theta"):
+        columns[name] = np.array([getattr(camera.intrinsics, name) for camera in cameras])
     theta = float(np.median(columns.pop("theta")))
     return LensCameras.of(
         columns | dict(zip(MODELS[model], coefficients.T, strict=True)),
@@ -358,31 +358,18 @@ def _cameras(tables: list[Table], notes: list[str]) -> LensCameras:
     )
 
 
-def _tabled(table: Table) -> _Rows:
-    n, size = len(table), table.metadata.image_size
-    positive = (table.numbers["alpha_u"] > 0) & (table.numbers["alpha_v"] > 0)
+def _in_rows(table: Table) -> list[Camera]:
+    """The cameras of a table: of the files that it names, relative to its folder, or of their parameters."""
+    if _FILES in table.labels:
+        return [read_intrinsics(Path(table.source).parent / name) for name in table.labels[_FILES].tolist()]
+    values = table.stack(_CAMERA)
+    positive = (values[:, :2] > 0).all(axis=1)
     if not positive.all():
         line = int(table.lines[np.argmin(positive)])
         problem = "alpha_u and alpha_v must be positive; correct or remove the row"
         raise FormatError(problem, table.source, line)
-    sizes = set() if size is None else {size}
-    return {**table.numbers, "theta": np.full(n, np.pi / 2)}, [Distortion()] * n, sizes
-
-
-def _listed(table: Table) -> _Rows:
-    """Read the calibration files named in a table, with paths relative to its folder."""
-    folder = Path(table.source).parent
-    cameras = [read_intrinsics(folder / name) for name in table.labels[_FILES].tolist()]
-    parameters = {
-        name: np.array([getattr(camera.intrinsics, name) for camera in cameras])
-        for name in (*_PARAMETERS, "theta")
-    }
-    sizes = {camera.image_size for camera in cameras} | {table.metadata.image_size}
-    return (
-        {**table.numbers, **parameters},
-        [camera.distortion for camera in cameras],
-        {size for size in sizes if size is not None},
-    )
+    size = table.metadata.image_size
+    return [Camera(Intrinsics(*row), Distortion(), size) for row in values.tolist()]
 
 
 def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array]:
