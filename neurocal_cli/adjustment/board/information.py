@@ -325,15 +325,14 @@ def point_terms(
     label: NDArray[np.intp],
     columns: NDArray[np.intp],
     n_points: int,
-    shapes: Array | None = None,
 ) -> PointTerms:
     """Sums of one camera over its observations of `n_points` target points.
 
-    `scale` (V,) is S2 of each view, `label` (T, n) is from `labelled`, `columns` (f,) are those of the
-    camera's free parameters, and `shapes` is as in `Sight`.
+    `scale` (V,) is S2 of each view, `label` (T, n) is from `labelled`, and `columns` (f,) are those of the
+    camera's free parameters.
     """
     fold = np.zeros(batches.n_views, dtype=np.intp)
-    terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1, shapes)
+    terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1)
     return replace(terms, point=terms.point[0], by_camera=terms.by_camera[0])
 
 
@@ -349,7 +348,7 @@ def folded_terms(
     shapes: Array | None = None,
     out: Array | None = None,
 ) -> PointTerms:
-    """The same sums over each of `n_folds` folds (V,) of the views.
+    """The same sums over each of `n_folds` folds (V,) of the views; `shapes` is as in `Sight`.
 
     `out` (V, p, n, 3) are zeros that become those of poses and points.
     """

@@ -32,7 +32,7 @@ from neurocal_cli.calibration.rig.edges import (
     exchanged_cameras,
     views_left_out,
 )
-from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames
+from neurocal_cli.calibration.rig.frames import connected_frames
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.refinement import with_board
 from neurocal_cli.calibration.rig.result import RigAssembly
@@ -47,7 +47,6 @@ _HERE = Pose(np.eye(3), np.zeros(3))
 
 def fit_rig(
     cameras: Mapping[str, Calibration],
-    views: FrameNames | None = None,
     *,
     refine_cameras: bool = False,
     outliers: str = "reject",
@@ -58,9 +57,7 @@ def fit_rig(
     Parameters
     ----------
     cameras : dict of Calibration by name
-        On one target, in one world unit.
-    views : FrameNames, optional
-        The frames of their views, by default as `connected_frames` finds them.
+        On one target, in one world unit. Their frames are as `connected_frames` finds them.
     refine_cameras : bool
         Whether the bundle adjustment also refines the intrinsic parameters and distortions that were
         estimated. Otherwise it refines the rig and the poses alone.
@@ -81,7 +78,7 @@ def fit_rig(
     if outliers not in ("reject", "keep"):
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
     names = list(cameras)
-    views = views or connected_frames({name: camera.points for name, camera in cameras.items()})
+    views = connected_frames({name: camera.points for name, camera in cameras.items()})
     cameras = dict(zip(names, with_agreeing_poses(list(cameras.values()), views), strict=True))
     problem = rig_problem(list(cameras.values()), views.of_views)
     edges = examined(problem, views.seen)
