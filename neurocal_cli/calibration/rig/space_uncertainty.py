@@ -224,7 +224,8 @@ def _places(points: Array) -> tuple[int, tuple[int, int]]:
     """The point in the middle, and two that are half as far from each other as all are across."""
 
     def nearest(place: Array) -> int:
-        return int(np.argmin(((points - place) ** 2).sum(axis=1)))
+        away = ((points - place) ** 2).sum(axis=1)
+        return int(np.argmin(np.round(away / away.max(), 9)))  # of a regular grid several are as near
 
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     quarter = np.array([np.ptp(points[:, 0]) / 4, 0.0, 0.0])

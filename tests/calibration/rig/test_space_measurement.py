@@ -24,6 +24,7 @@ from neurocal_cli import (
     read_points,
     triangulate,
 )
+from neurocal_cli.calibration.rig.space_uncertainty import _places
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.result_files import write_rig
@@ -169,3 +170,9 @@ def test_the_commands_show_both(tmp_path: Path) -> None:
     tree = json.loads(run("evaluate", camera, "--positions", "--json").stdout)["positions"]
     assert set(tree) == {f"view{k:02d}" for k in range(1, 11)}
     assert min(tree["view01"]["std"]) > 0
+
+
+def test_of_points_equally_near_the_middle_rounding_does_not_choose() -> None:
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(6.0), np.arange(4.0)))
+    grid, rng = np.column_stack([x, y, np.full(24, 1000.0)]), np.random.default_rng(1)
+    assert {_places(grid + 1e-13 * rng.standard_normal(grid.shape)) for _ in range(20)} == {_places(grid)}
