@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.finding.grow import edges_visible, grow, has_block, is_smooth, remove_outliers
+from neurocal_cli.detection.finding.grow import grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.links import (
     Links,
@@ -52,7 +52,6 @@ _MOST_SEARCHED = 30_000_000
 # Insensitive. Number of seeds of a level that may fail; limits the time if there is no board
 # (test_detection_speed.py, "clutter only").
 _TRIES, _TRIES_2X3 = 8, 4
-_UNFINISHED = 0.4  # least share of the wanted vertices in a lattice that a wide lens may have cut short
 _BEHIND = 3.0  # ratio of the squares' sizes above which a second board is not searched
 
 
@@ -116,9 +115,7 @@ def _find_bent(
     The links exclude saddles in lattices that had `masked` vertices in all.
     """
     lost = masked > sum(int(x.seen.sum()) for x in known)
-    least = _UNFINISHED * min((cols * rows for cols, rows in wanted), default=np.inf)
-    unfinished = [x for x in known if x.seen.sum() >= least]
-    if not (lost or unfinished or (links is not None and any_left(links, known))):
+    if not (lost or (links is not None and any_left(links, known))):
         return known, []
     if masked:
         links = find_links(level)
@@ -128,7 +125,7 @@ def _find_bent(
     def search(view: NDArray[np.float32]) -> list[Lattice]:
         return _find(pyramid(view), wanted, straight=True)
 
-    found = find_bent(level, links, known, unfinished, search)
+    found = find_bent(level, links, known, search)
     left = drop_duplicates(found + known) if found else known
     return [x for x in left if x not in found], [x for x in left if x in found]
 
@@ -199,7 +196,7 @@ def _grow_from_seeds(
         else:
             first = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
             grid = remove_outliers(level, grow(level, first if lattice is None else lattice))
-        boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_visible(level, x)]
+        boards = [x for x in _boards(grid) if is_smooth(level, x)]
         if boards:
             found += boards
             nearest = max(nearest, _nearest_whole(boards, wanted))

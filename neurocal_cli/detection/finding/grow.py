@@ -46,8 +46,7 @@ _OFFSETS = np.array(
 _CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)
 _ACROSS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-1.0, 1, -1, 1])])
 
-# Limits of whole lattices. Insensitive, except _EDGES, which is a share: doubled, it rejects all boards.
-_EDGES = 0.9  # least share of visible edges
+# Limits of whole lattices. Insensitive.
 # Greatest rms distance of vertices from the predictions of their neighbours: in squares, plus px, plus px per
 # ratio of the noise (of second derivatives) to the contrast.
 _OFF_MAP, _OFF_MAP_PX, _OFF_MAP_NOISE = 0.021, 0.09, 20.0
@@ -270,33 +269,3 @@ def is_smooth(level: Level, lattice: Lattice) -> bool:
     )
     most = 1 if len(row) >= _MANY else _FEW_SMOOTH
     return float(np.sqrt((off**2).mean())) / tolerated < most
-
-
-def edges_visible(level: Level, lattice: Lattice) -> bool:
-    """Whether the edges between neighbouring vertices separate dark from light."""
-    row, col, predicted = lattice.predicted
-    pixels, contrast = lattice.pixels, lattice.contrast
-    c, r = np.full_like(pixels, np.nan), np.full_like(pixels, np.nan)
-    c[row, col], r[row, col] = predicted.c, predicted.r
-    visible = [
-        _edges_with_contrast(level, pixels, r, contrast, lattice.dark),
-        # Exchanging rows and columns also exchanges the two sides of an edge.
-        _edges_with_contrast(
-            level, pixels.transpose(1, 0, 2), c.transpose(1, 0, 2), contrast.T, lattice.dark
-        ),
-    ]
-    return float(np.concatenate(visible).mean()) >= _EDGES
-
-
-def _edges_with_contrast(level: Level, pixels: Array, steps: Array, contrast: Array, dark: int) -> Array:
-    """Whether each edge along a row has contrast, given the steps (rows, cols, 2) to the next row."""
-    known = np.isfinite(pixels[..., 0])
-    row, col = np.nonzero(known[:, :-1] & known[:, 1:])
-    start, end = pixels[row, col], pixels[row, col + 1]
-    across = 0.5 * (steps[row, col] + steps[row, col + 1])
-    middle = 0.5 * (start + end)
-    sides = np.stack([middle + _ASIDE * across, middle - _ASIDE * across], axis=1)
-    value = interpolate(level.smooth, sides)
-    rise = (value[:, 1] - value[:, 0]) * signs(row, col, dark)
-    usual = np.minimum(contrast[row, col], contrast[row, col + 1])
-    return np.asarray(rise > _LEAST_EDGE * usual)

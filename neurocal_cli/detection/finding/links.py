@@ -32,7 +32,6 @@ _FEWEST = 9  # saddles, for 3 x 3 vertices
 _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the neighbour
 _SHARE = 0.45  # the same angle as a share of the vertex's narrower angle
 _ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within the latter angle
-_SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... or greatest second difference times this weight
 # Insensitive: a lattice rejected here is grown instead, which only costs time
@@ -73,10 +72,7 @@ def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links 
     distance = du * du + dv * dv
     np.fill_diagonal(distance, np.inf)
     port = _port_towards(du, dv, saddles.ports)
-    contrast = saddles.contrast.astype(np.float32)
     fit = (port >= 0) & (port.T >= 0) & ((port ^ port.T) & 1 == 1)
-    fit &= contrast[:, None] > _SIMILAR * contrast[None, :]
-    fit &= contrast[None, :] > _SIMILAR * contrast[:, None]
     to = np.full((count, 4), -1, dtype=np.intp)
     entry = np.full((count, 4), -1, dtype=np.intp)
     rows = np.arange(count)

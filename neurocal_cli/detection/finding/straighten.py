@@ -31,7 +31,6 @@ _GROUPS = 3  # greatest number of linked groups that are tried
 _OFF = 0.12  # squares; greatest rms distance of vertices from the fit of the lens ...
 _OUTLIER = 0.3  # ... and least limit of the distance beyond which a vertex is an outlier
 _ROUNDS = 3  # of removing such outliers
-_WIDE = 0.5  # rad; least angle from the axis at which lens distortion may be why a lattice is unfinished
 _MORE = 1.1  # a group is searched again if it has this many times the known vertices in it
 _AROUND, _LEAST_AROUND = 0.75, 4.0  # margin of the view around the group: share of its extent, least squares
 _SQUARE = 24.0  # px; side of a square in the view ...
@@ -67,23 +66,20 @@ def find_bent(
     level: Level,
     links: Links,
     known: list[Lattice],
-    unfinished: list[Lattice],
     search: Callable[[NDArray[np.float32]], list[Lattice]],
 ) -> list[Lattice]:
-    """Search again around groups of linked saddles that exceed the lattices, and around unfinished lattices.
+    """Search again around groups of linked saddles that exceed the lattices.
 
-    The links are those of the whole level, including known lattices. Unfinished lattices are known ones that
-    a wide lens may have kept from growing. `search` finds the lattices of an image. Each lattice found, in
-    the level's pixels, has more vertices than the known ones at the same place.
+    The links are those of the whole level, including known lattices. `search` finds the lattices of an image.
+    Each lattice found, in the level's pixels, has more vertices than the known ones at the same place.
     """
     found: list[Lattice] = []
-    groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]
-    groups += [(np.argwhere(x.seen)[:, ::-1], x.pixels[x.seen], 1.0, _WIDE) for x in unfinished]
-    for places, pixels, more, wide in groups:
-        if len(pixels) < more * _most_shared([*known, *found], pixels):
+    for places, members in _groups(links):
+        pixels = links.saddles.points[members]
+        if len(pixels) < _MORE * _most_shared([*known, *found], pixels):
             continue
         fit = _fitted(places.astype(float), pixels, level)
-        if fit is None or fit.lens.angles(pixels).max() < wide:
+        if fit is None:
             continue
         view = PlaneView.of(fit, places.astype(float))
         for lattice in search(view.seen(level.image)):
