@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import Detection, label
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.detection.identify import Located
 from neurocal_cli.detection.wide_lens import fit_wide_lens
 
@@ -170,11 +171,10 @@ def plane_residuals(
     grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
     if located is not None:
         grid = located.plane.spread(located.placement.apply(grid))
-    H = cv2.findHomography(grid, measured.pixels, 0)[0] if len(grid) >= 5 else None
-    if H is None:
+    if len(grid) < 5:
         return np.zeros_like(measured.pixels)
-    seen = np.column_stack([grid, np.ones(len(grid))]) @ H.T
-    left = np.asarray(measured.pixels - seen[:, :2] / seen[:, 2:], dtype=float)
+    seen = homography_at(homographies(grid[None], measured.pixels[None]), grid[None])[0]
+    left = measured.pixels - seen
     if size is not None and len(grid) >= _FEWEST_WIDE:
         wide = fit_wide_lens(grid, measured.pixels, size).residual
         left = wide if (wide**2).sum() < (left**2).sum() else left

@@ -17,6 +17,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import Index, Lattice, predict_vertices
 from neurocal_cli.detection.grid import TURNS
+from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.detection.medians import median, quantile
 
 # Insensitive; FOLDED and "two boards" in test_finding.py repeat this.
@@ -189,21 +190,11 @@ def _continued(base: Lattice, other: Lattice) -> Array:
     away = distance(p, q)
     # Lens distortion bends the plane, so the vertices near the other lattice have the largest weights.
     weight = np.exp(-(away - away.min()) / (_NEAR * max(base.width, 1e-3)))
-    centre, scale = p.mean(axis=0), max(float(p.std()), 1e-6)
-    x, y = ((p - centre) / scale).T
-    c, r, one, zero = col.astype(float), row.astype(float), np.ones(len(col)), np.zeros(len(col))
-    A = np.concatenate(
-        [
-            np.stack([x, y, one, zero, zero, zero, -c * x, -c * y, -c], axis=-1) * weight[:, None],
-            np.stack([zero, zero, zero, x, y, one, -r * x, -r * y, -r], axis=-1) * weight[:, None],
-        ]
-    )
-    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3)
-    ahead = np.concatenate([(q - centre) / scale, np.ones((len(q), 1))], axis=1) @ H.T
-    side = np.sign(np.median(np.stack([x, y, one], axis=-1) @ H[2]))
-    depth = ahead[:, 2] * side
-    depth = np.where(depth > 1e-9, depth, np.nan)
-    return np.asarray(ahead[:, :2] * side / depth[:, None])
+    H = homographies(p[None], np.stack([col, row], axis=-1)[None].astype(float), weight[None])
+    # Beyond the horizon of the plane there is nothing.
+    depth = np.column_stack([q, np.ones(len(q))]) @ H[0, 2]
+    usual = np.median(np.column_stack([p, np.ones(len(p))]) @ H[0, 2])
+    return np.where((depth * usual > 0)[:, None], homography_at(H, q[None])[0], np.nan)
 
 
 def split_at_folds(lattice: Lattice) -> list[Lattice]:

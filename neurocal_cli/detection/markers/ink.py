@@ -28,6 +28,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.edge_profile import Real, profile
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Single
+from neurocal_cli.detection.homographies import homographies
 
 # sigma, beyond which a pattern changes the light by less than 0.0002 half contrasts, and beyond which the
 # inner part of a marker with a border does not matter
@@ -165,7 +166,8 @@ def _near_edges(
     """
     height, width = result.shape
     parts = []
-    for H, box, inner, s in zip(_homographies(corners), corners, ink.inner, sigma.tolist(), strict=True):
+    to_cells = homographies(corners, np.broadcast_to(_CORNERS, corners.shape))
+    for H, box, inner, s in zip(to_cells, corners, ink.inner, sigma.tolist(), strict=True):
         room = _REACH * s + _SLACK
         low = np.maximum(np.floor(box.min(axis=0) - room), 0).astype(int)
         high = np.minimum(np.ceil(box.max(axis=0) + room) + 1, [width, height]).astype(int)
@@ -195,19 +197,6 @@ def _near_edges(
     pixels = np.repeat(corners.mean(axis=1)[:, None], used.shape[1], axis=1)
     pixels[used] = np.concatenate(parts)
     return pixels, used
-
-
-def _homographies(corners: Array) -> Array:
-    """(N, 3, 3) homographies from pixels to the places in cells with corners (N, 4, 2)."""
-    n = len(corners)
-    rows = np.zeros((n, 8, 8))
-    for k, (a, b) in enumerate(_CORNERS.tolist()):
-        u, v = corners[:, k].T
-        rows[:, 2 * k, :3] = rows[:, 2 * k + 1, 3:6] = np.stack([u, v, np.ones(n)], axis=-1)
-        rows[:, 2 * k, 6:] = -a * corners[:, k]
-        rows[:, 2 * k + 1, 6:] = -b * corners[:, k]
-    values = np.linalg.solve(rows, np.tile(_CORNERS.reshape(-1, 1), (n, 1, 1)))[..., 0]
-    return np.concatenate([values, np.ones((n, 1))], axis=1).reshape(n, 3, 3)
 
 
 @frozen_dataclass(eq=False)
