@@ -142,7 +142,8 @@ def least_by_precision(M: Array, values: Array, along: Array) -> Callable[[Array
 
 
 FOLDS = 5
-_RIDGE = 1e-13  # added to the scaled diagonal, so that one undetermined pose does not spoil the other views
+RIDGE = 1e-13
+"""Added to the scaled diagonal, so that one undetermined pose does not spoil the other views."""
 _GOLDEN = 0.6180339887498949
 _Penalty = tuple[Array, Array]  # prior added to the normal matrix (f, f) and to the right side (f,)
 
@@ -160,7 +161,7 @@ def _eliminated(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> tup
     """Quadratics, and the poses' response to the shared parameters with their own step; (..., 6, f + 1)."""
     kept = np.append(free_columns(free), normal.shape[-1] - 1)
     if free_poses:
-        left, solved = eliminate(normal, kept, POSE_COLUMNS, _RIDGE)
+        left, solved = eliminate(normal, kept, POSE_COLUMNS, RIDGE)
     else:
         left, solved = normal[..., kept[:, None], kept], np.zeros((*normal.shape[:-2], 6, len(kept)))
     return Quadratics(left[..., :-1, :-1], left[..., :-1, -1], left[..., -1, -1]), solved

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
+from neurocal_cli.adjustment.board.prior import STRETCH
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
@@ -30,7 +31,7 @@ from neurocal_cli.calibration.verdict.findings import (
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
 from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS, SHAPES, TOO_SIMPLE
-from neurocal_cli.calibration.verdict.words import DETERMINE
+from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
@@ -40,8 +41,6 @@ _MOST = 3  # causes at once
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
 _MUCH = 0.3  # share of the evidence, or of the squared error
-_SHAPED = 0.003  # prior std of stretch and bends over the half length: prints are off by a few thousandths
-_LINEAR = 0.02  # of the focal length: largest difference of two cameras that is not fitted
 
 
 @frozen_dataclass(eq=False)
@@ -106,7 +105,7 @@ def _with_shape(lin: Linearised) -> Linearised:
     """
     new = np.concatenate([rival.steps_at(lin).argmax(axis=0) for rival in SHAPES])
     R = lin.R.copy()
-    R[0, new, new] += lin.cost / lin.spare / _SHAPED**2
+    R[0, new, new] += lin.cost / lin.spare / (2 * STRETCH) ** 2
     return replace(lin, R=R, free=np.concatenate([lin.free, new]), spare=max(lin.spare - len(new), 1.0))
 
 
@@ -240,7 +239,7 @@ def _fitted(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> _F
 
 def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
     views, state, K = lin.views, lin.state, len(lin.state.k)
-    if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > _LINEAR:
+    if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > NEAR:
         free, member = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5
         groups = np.flatnonzero(member), np.flatnonzero(~member)
         each = [

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.cross_validation import RIDGE
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, camera_columns, derivatives
 from neurocal_cli.adjustment.views import Views
@@ -21,7 +22,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-_RIDGE = 1e-13  # as in cross-validation
 _FLAT = 0.02  # largest thickness over size of a board that counts as flat
 _ACROSS = 11  # points of a grid on the board
 _ALONG = 1e-6  # by which a normal that is an axis of the world may differ from it
@@ -153,7 +153,7 @@ def linearised(
     N = views.batches.sum_by_view(np.concatenate([J @ np.swapaxes(J, 1, 2) for J in flat]))
     kept = np.concatenate([camera_columns(K), np.arange(11 + K, N.shape[1])])
     if free_poses:
-        R, solved = eliminate(N, kept, POSE_COLUMNS, _RIDGE)
+        R, solved = eliminate(N, kept, POSE_COLUMNS, RIDGE)
     else:
         R, solved = N[:, kept[:, None], kept], np.zeros((len(N), 6, len(kept)))
     columns: dict[Effect | str, NDArray[np.intp]] = {"lens": np.arange(len(free), 5 + K)}

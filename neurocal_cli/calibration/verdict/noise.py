@@ -27,10 +27,8 @@ from neurocal_cli.observations.target import Target
 # Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
 _ONE_WAY = 2.5  # rms along u over that along v, or the reverse
 _VIEW = 4.0  # rms of a view over the lower quartile of all views
-# Points with a sigma below this share of the median one are compared with the others, from so many on.
-_FAR_BELOW, _FEWEST_SMALL = 0.5, 6
 _TAKEN_IN = 1e-2  # share of the error that is left
-# Between views or points whose sigma is too small and the others; six points reach it once in 500,000 sets.
+# Between views or points whose sigma is too small and the others, and between the sigmas of such points.
 _FACTOR = 2.0
 
 
@@ -98,9 +96,9 @@ def stated_noise(points: Correspondences, residuals: Array, correlation: float) 
 def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[Finding]:
     """Finding about the points of the smallest sigma (N,), if their residuals are not as small."""
     usual = median(sigma)
-    few = sigma < _FAR_BELOW * usual
+    few = sigma * _FACTOR < usual
     n = int(few.sum())
-    if n < _FEWEST_SMALL:
+    if n < FEW_POINTS:
         return
     squared = (residuals**2).sum(axis=1) / sigma**2
     ratio = float(squared[few].mean() / max(squared[~few].mean(), 1e-300))

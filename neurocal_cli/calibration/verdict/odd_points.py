@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.findings import Finding, Limit, name_some
+from neurocal_cli.calibration.verdict.findings import FEW_POINTS, Finding, Limit, name_some
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.observations.points import Correspondences
 
-_FEWEST = 20  # fewest points from which whole numbers are no chance
 # Clipped: at least this number of points, and this share, have exactly the same outermost coordinate.
 _ALIKE = 6
 _ALIKE_SHARE = 0.01
@@ -27,7 +26,6 @@ _SOME = 0.01  # share of points outside the image up to which they count as sing
 _SAME = 1e-3  # px by which a copy of a view may differ
 _NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 _SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
-_SHARED = 0.5  # share of a view's points that other views show as well: the same target, only partly seen
 _MOST_POINTS = 400  # most points of a view that are used
 _ROUND = 0.01  # relative difference within which a ratio is one of two units
 _UNITS = {
@@ -84,7 +82,7 @@ def odd_pixels(points: Correspondences) -> Iterator[Finding]:
 
 def _step(pixels: Array) -> int:
     """Greatest common divisor of all coordinates; 0 if they are not whole numbers."""
-    if len(pixels) < _FEWEST or np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
+    if len(pixels) < FEW_POINTS or np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
         return 0
     return int(np.gcd.reduce(pixels.astype(np.int64), axis=None))
 
@@ -253,7 +251,7 @@ def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.b
     for k in np.flatnonzero(off):
         both = np.concatenate([known, np.unique(np.round(worlds[k], 6), axis=0)])
         common = len(both) - len(np.unique(both, axis=0))
-        shared[k] = common > _SHARED * (len(both) - len(known))
+        shared[k] = 2 * common > len(both) - len(known)
     return shared
 
 

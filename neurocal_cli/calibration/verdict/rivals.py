@@ -11,8 +11,6 @@ from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, SHARE, L
 from neurocal_cli.calibration.verdict.rival import Rival
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 
-# Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 %.
-_OFF = Limit(0.005, 0.05)  # of the focal length
 CHANGED = Limit(0.002, 0.05)
 """Limits of a change of the focal length or the centre, over the focal length; a result has half of it."""
 SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
@@ -111,7 +109,7 @@ RIVALS: tuple[Rival, ...] = (
         "two groups of views, each with a target of another length along one side",
         "give each view the points of the target that it shows",
         words.two_targets,
-        _OFF,
+        CHANGED,
         effects.grouped,
         effect=effects.stretch,
     ),
@@ -129,7 +127,7 @@ RIVALS: tuple[Rival, ...] = (
         "residuals that repeat on the target in all views, along its normal",
         _FLAT,
         words.bent,
-        _OFF,
+        CHANGED,
         effects.common,
         effect=effects.bends,
         of_board=True,
@@ -139,7 +137,7 @@ RIVALS: tuple[Rival, ...] = (
         "residuals that repeat on the target in all views, within its plane",
         _FLAT,
         words.stretched,
-        _OFF,
+        CHANGED,
         effects.common,
         effect=effects.stretch,
         of_board=True,

@@ -53,12 +53,10 @@ _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
 _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
-# rad. From photographs, the image axes of eight cameras are estimated to be off a right angle by up to
-# 0.0018, and the sides of their boards by up to 0.003. A board that leans by 0.006 and stands upright in
-# all views may turn theta by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
-_SKEW = 0.003
-# Of the size of a target, also in rad; of nine boards of photographs the points of none are off by more than
-# 0.0017 rms.
+# rad, and of a target's size. From photographs, the image axes of eight cameras are estimated to be off a
+# right angle by up to 0.0018, and the sides of their boards by up to 0.003; the points of none of nine boards
+# are off by more than 0.0017 rms. A board that leans by 0.006 and stands upright in all views may turn theta
+# by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
 _MISPRINT = 0.004
 _UNCHECKED = (
     "the camera needs every view, so it may take in errors of single views, such as a board that bends, and "
@@ -307,7 +305,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
             "few cameras have such pixels; otherwise check the size of the squares along X and Y",
         )
-    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEW + TOLD * std["theta"]:
+    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _MISPRINT + TOLD * std["theta"]:
         yield (
             1,
             f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.2f} degrees",

@@ -14,7 +14,8 @@ from neurocal_cli.calibration.verdict.linearised import Linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Said, Say, Told
 from neurocal_cli.camera.geometry import Array
 
-_NEAR = 0.02  # of the focal length: equal up to this
+NEAR = 0.02
+"""Of the focal length: two cameras are equal up to this."""
 _TURNED = 0.3  # of the distance of two centres: how far their mean may be from the middle of the image
 DETERMINE = 3
 """Views that determine a camera of their own."""
@@ -113,15 +114,15 @@ def _alternative(first: Array, second: Array, middle: Array, exchanged: bool) ->
 
     `middle` is that of the image, and `exchanged` tells whether one group shows the target mirrored.
     """
-    ratio, near = first / second, _NEAR * second[0]
+    ratio, near = first / second, NEAR * second[0]
     if exchanged:
         return "u and v are exchanged in one part"
-    if np.abs(ratio / ratio[0] - 1).max() < min(0.3 * abs(ratio[0] - 1), 2 * _NEAR):
+    if np.abs(ratio / ratio[0] - 1).max() < min(0.3 * abs(ratio[0] - 1), 2 * NEAR):
         return "are of two sizes"
     zoomed, apart = np.abs(first[:2] - second[:2]).max(), np.abs(first[2:] - second[2:]).max()
     if zoomed < 2 * near and np.abs(0.5 * (first[2:] + second[2:]) - middle).max() < 0.5 * _TURNED * apart:
         return "turned by 180 degrees"
-    if abs(ratio[0] - ratio[1]) > 0.5 * abs(ratio[:2] - 1).max() > _NEAR:
+    if abs(ratio[0] - ratio[1]) > 0.5 * abs(ratio[:2] - 1).max() > NEAR:
         return "their target or their images are stretched in one part"
     if zoomed >= near:
         return "from two zooms"
