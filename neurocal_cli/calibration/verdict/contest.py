@@ -36,8 +36,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-_AHEAD = 4  # rivals that are tried together with another one
-_MOST = 3  # causes at once
+_MOST = 3  # causes at once, and rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
 _MUCH = 0.3  # share of the evidence, or of the squared error
@@ -183,7 +182,7 @@ def _best(
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
-    for one in [one for one in others if one.weights.size][:_AHEAD]:
+    for one in [one for one in others if one.weights.size][:_MOST]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.

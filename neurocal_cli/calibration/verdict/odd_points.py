@@ -37,8 +37,7 @@ _UNITS = {
     304.8: "feet and millimetres",
     12.0: "feet and inches",
 }
-_OUTLIERS = Limit(0.02, 0.2)  # of the points
-_OF_A_VIEW = 0.2  # share of a view's points from which on it is named; clean views lose none
+_OUTLIERS = Limit(0.02, 0.2)  # of the points, and of those of a view that is named; clean views lose none
 _FEWEST_OUTLIERS = 4  # fewest outliers of a view, or views of a point
 _OF_A_POINT = 0.6  # share of its views in which a target point must be an outlier to be named
 
@@ -309,7 +308,7 @@ def _of_views(calibration: Calibration, lost: Correspondences) -> dict[str, int]
     return {
         name: count
         for name, count in counts.items()
-        if name in kept and count >= _FEWEST_OUTLIERS and count > _OF_A_VIEW * (count + kept[name])
+        if name in kept and count >= _FEWEST_OUTLIERS and count > _OUTLIERS.poor * (count + kept[name])
     }
 
 

@@ -23,7 +23,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
-_NO_COST, _ROUNDING = 1e-12, 1e-9
+_ROUNDING = 1e-9
 _ITERATIONS = 3  # the noise is what the rival leaves
 ABSORBED = 1e-7
 """Share of the information about an unknown, beside the poses, that is not more than rounding."""
@@ -214,7 +214,7 @@ class Known:
         inverse = scale[:, None] * np.linalg.inv(M[:-1, :-1] * np.outer(scale, scale)) * scale
         right = inverse @ M[:-1, -1]
         cost = float(M[-1, -1] - right @ M[:-1, -1])
-        return cls(M, n, inverse, right, cost, max(_NO_COST * cost, least))
+        return cls(M, n, inverse, right, cost, max(_ROUNDING * cost, least))
 
     def evidence(self, left: Array, spread: Array) -> Array:
         """Log odds of what leaves this squared error, with the log determinant of its unknowns."""
