@@ -91,12 +91,12 @@ def reading_failures(source: str) -> Iterator[None]:
 
 
 @contextmanager
-def value_failures(source: str, where: str = "", line: int | None = None) -> Iterator[None]:
-    """Turn errors about values into messages that name the file and the place in it."""
+def value_failures(source: str, where: str = "", line: int | None = None, advice: str = "") -> Iterator[None]:
+    """Turn errors about values into messages that name the file and the place in it, and end in `advice`."""
     try:
         yield
     except InputError as error:
-        raise FormatError(f"{where}{error}", source, line) from error
+        raise FormatError(f"{where}{error}", source, line, advice) from error
 
 
 def reason(error: BaseException) -> str:

@@ -232,7 +232,7 @@ def camera_part(root: Field) -> dict[str, Any]:
     values = [parameters[name][0] if name in parameters else np.nan for name in INTRINSIC_NAMES]
     if np.isnan(values).any():
         block["parameters"][INTRINSIC_NAMES[int(np.argmax(np.isnan(values)))]]  # it is missing
-    with value_failures(root.source, f"{path}: "):
+    with value_failures(root.source, f"{path}: ", advice="correct it"):
         intrinsics = Intrinsics(*values)
     if K is not None and np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():
         root.refuse(f"camera_matrix and {path} disagree; correct the one that was edited")

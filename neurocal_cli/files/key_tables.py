@@ -433,7 +433,7 @@ def record(make: Callable[..., Any], keys: Keys, inline: bool = False) -> Kind:
         return [f"{key}: {keys.flow(value)}"] if inline else block(key, keys.lines(value, long))
 
     def read(field: Field) -> Any:
-        with value_failures(field.source, f"{field.path}: "):
+        with value_failures(field.source, f"{field.path}: ", advice="correct it"):
             return make(**keys.read(field))
 
     return Kind(read, lines)

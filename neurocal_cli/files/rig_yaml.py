@@ -132,7 +132,7 @@ def stereo_from_field(root: Field) -> StereoRig:
     if (unit := block["unit"].text()) != left.unit:
         root.refuse(f"stereo.unit is {unit}, but left and right are in {left.unit}; correct the one edited")
     found = _POSE.read(block)
-    with value_failures(root.source, "stereo: "):
+    with value_failures(root.source, "stereo: ", advice="correct it"):
         pose = Pose(found["R"], found["t"])
     stated = {**found["rotation"], **found["translation"]}
     delay = found["delay"] or {"timed": False}
