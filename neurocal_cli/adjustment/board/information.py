@@ -296,11 +296,13 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArr
     kept, place = np.append(columns, normal.shape[1] - 1), np.append(np.arange(own.start, own.stop), -1)
     found.cameras.shared[:, place[:, None], place] += by_fold[:, kept[:, None], kept]
     found.point[...] += px2 * terms.point
-    found.by_camera[..., place] += px2 * terms.by_camera
+    found.by_camera[..., own] += px2 * terms.by_camera[..., :-1]  # slices are faster than indices
+    found.by_camera[..., -1] += px2 * terms.by_camera[..., -1]
     if sight.free_poses:
         of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
         found.cameras.own[poses] = px2 * normal[:, of_pose[:, None], of_pose]
-        found.cameras.cross[poses][:, :, place] = px2 * normal[:, of_pose[:, None], kept]
+        found.cameras.cross[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
+        found.cameras.cross[poses, :, -1] = px2 * normal[:, of_pose, -1]
         found.pose_point[poses] *= px2
 
 
