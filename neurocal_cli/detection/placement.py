@@ -334,8 +334,8 @@ def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) ->
             "show the whole board, sharp and evenly lit",
             shape,
         )
-    doubtful = surrounded(ends) and set(ends.values()) != {End.BOARD}
-    if doubtful and len(board.planes) == 1 and _fits(shape, board.planes[0]):
+    may_be_a_part = len(board.planes) == 1 and _fits(shape, board.planes[0])
+    if may_be_a_part and surrounded(ends) and set(ends.values()) != {End.BOARD}:
         return NoBoardError(
             f"detected {_size(shape)} inner vertices with ends on all sides, but the board has {wanted}; "
             "give the size of the board in the image, or show the whole board, evenly lit",
@@ -344,7 +344,7 @@ def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) ->
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
     return NoBoardError(
         f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "
-        "image",
+        f"image{', or show all of it' if may_be_a_part else ''}",
         shape,
     )
 
