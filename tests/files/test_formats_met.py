@@ -1213,3 +1213,12 @@ def test_a_long_text_without_a_camera_is_refused_at_once(text: str, tmp_path: Pa
     # Patterns that go back over the text would take minutes for it.
     with pytest.raises(FormatError):
         read_cameras([written(text * (60_000 // len(text)), tmp_path)])
+
+
+def test_a_mistake_in_one_of_several_cameras_names_it(tmp_path: Path) -> None:
+    one = "S_{0}: {1}\nK_{0}: 700 0 600 0 700 180 0 0 1\nD_{0}: 0 0 0 0 0\n"
+    one += "R_{0}: 1 0 0 0 1 0 0 0 1\nT_{0}: {0} 0 0\n"
+    path = tmp_path / "calib_cam_to_cam.txt"
+    path.write_text("calib_time: 09-Jan-2012\n" + one.format("00", "1242 375") + one.format("01", "1242"))
+    with pytest.raises(FormatError, match=r"image_01.S must be two whole numbers"):
+        read_cameras([path])

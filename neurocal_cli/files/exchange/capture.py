@@ -21,7 +21,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
 from neurocal_cli.files.exchange.tree_paths import toml_text
 from neurocal_cli.files.tree_fields import Field
 
@@ -107,16 +107,13 @@ def easymocap_names(document: Document) -> list[str]:
     return found if found and {f"K_{found[0]}", f"T_{found[0]}"} & set(document.tree) else []
 
 
-def _easymocap_parts(document: Document) -> dict[str, Field]:
+def _easymocap_parts(document: Document) -> dict[str, Tree]:
     names, root = easymocap_names(document), document.root
     if f"K_{names[0]}" not in root or (len(names) > 1 and f"T_{names[0]}" not in root):
         raise InputError("is one of the two files of EasyMocap; give intri.yml and extri.yml")
     keys, model = ("K", "dist", "Rot", "T"), "fisheye" if document.distortion == "fisheye" else ""
     return {
-        name: Field(
-            {"model": model} | {key: root[f"{key}_{name}"].value for key in keys if f"{key}_{name}" in root},
-            root.source,
-        )
+        name: {"model": model} | {key: root[f"{key}_{name}"].value for key in keys if f"{key}_{name}" in root}
         for name in names
     }
 

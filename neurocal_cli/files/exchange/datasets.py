@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens
 from neurocal_cli.files.exchange.document import Document, assignments
-from neurocal_cli.files.exchange.format_table import PoseKeys, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
 from neurocal_cli.files.exchange.tree_paths import in_order, under
 from neurocal_cli.files.tree_fields import Field, is_number
 
@@ -29,20 +29,16 @@ def _kitti_lines(text: str) -> dict[str, list[float]]:
     return {key: [float(word) for word in words] for key, words in numbers.items()}
 
 
-def _kitti_parts(document: Document) -> dict[str, Field]:
+def _kitti_parts(document: Document) -> dict[str, Tree]:
     lines = _kitti_lines(document.text)
     ids = sorted(key[2:] for key in lines if key.startswith("K_"))
     if ids:
-        return {
-            f"image_{k}": Field({key: lines.get(f"{key}_{k}", []) for key in "SKDRT"}, document.source)
-            for k in ids
-        }
+        return {f"image_{k}": {key: lines.get(f"{key}_{k}", []) for key in "SKDRT"} for k in ids}
     parts = {}
     for key in sorted(key for key in lines if key[:1] == "P" and key[1:].isdecimal()):
         P = Field(lines[key], document.source, key).array(12).reshape(3, 4)
         t = np.linalg.solve(P[:, :3], P[:, 3]).tolist()
-        tree = {"K": P[:, :3].tolist(), "D": [0.0], "R": np.eye(3).tolist(), "T": t}
-        parts[f"image_{key[1:]}"] = Field(tree, document.source)
+        parts[f"image_{key[1:]}"] = {"K": P[:, :3].tolist(), "D": [0.0], "R": np.eye(3).tolist(), "T": t}
     return parts
 
 
@@ -138,12 +134,12 @@ NUSCENES = table(
 # Middlebury and ETH3D: a rectified pair, whose second camera is at (baseline, 0, 0) of the first.
 
 
-def _middlebury_parts(document: Document) -> dict[str, Field]:
+def _middlebury_parts(document: Document) -> dict[str, Tree]:
     stated = assignments(document.text)
     root = Field({name: value.tolist() for name, value in stated.items()}, document.source)
     width, height, baseline = (float(root[key].array(1, 1)[0, 0]) for key in ("width", "height", "baseline"))
     common = {"size": [width, height], "R": np.eye(3).tolist(), "t": [-baseline, 0.0, 0.0]}
-    return {name: Field({"K": root[name].value, **common}, root.source) for name in ("cam0", "cam1")}
+    return {name: {"K": root[name].value, **common} for name in ("cam0", "cam1")}
 
 
 MIDDLEBURY = table(

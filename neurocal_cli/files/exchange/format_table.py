@@ -48,7 +48,7 @@ from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.tree_paths import at, find, numbers_at, put, split
 from neurocal_cli.files.tree_fields import Field
 
-Parts = Callable[[Document], Mapping[str, Field]]  # the tree of each camera of a file, by its name
+Parts = Callable[[Document], Mapping[str, Any]]  # the tree of each camera of a file, by its name
 Tree = dict[str, Any]
 _SIZES = (3, 4, 9), (3,)  # numbers of a rotation and a translation
 
@@ -159,7 +159,10 @@ def table(
     """
 
     def read(document: Document) -> CameraSet:
-        found = parts(document)
+        found = {
+            name: one if isinstance(one, Field) else Field(one, document.source, name)
+            for name, one in parts(document).items()
+        }
         cameras = in_poses(found)
         if views is not None:
             cameras = replace(cameras, poses=views(next(iter(found.values()))))

@@ -165,7 +165,7 @@ _BASALT = CameraKeys(
 _TO_IMU = PoseKeys(("T_imu_cam/qw,qx,qy,qz:quaternion", "T_imu_cam/px,py,pz"), back=True, frame="imu")
 
 
-def _basalt_parts(document: Document) -> dict[str, Field]:
+def _basalt_parts(document: Document) -> dict[str, Tree]:
     root = document.root.get("value0", document.tree)
     cameras, sizes = (list(root[key].items()) for key in ("intrinsics", "resolution"))
     if len(sizes) != len(cameras):
@@ -173,14 +173,7 @@ def _basalt_parts(document: Document) -> dict[str, Field]:
     poses = list(root["T_imu_cam"].items()) if "T_imu_cam" in root else []
     lists = {"resolution": sizes, "T_imu_cam": poses}
     return {
-        f"cam{k}": Field(
-            {
-                **{key: entry.value for key, entry in camera.entries().items()},
-                **{key: own[k].value for key, own in lists.items() if k < len(own)},
-            },
-            root.source,
-            f"cam{k}",
-        )
+        f"cam{k}": {**camera.value, **{key: own[k].value for key, own in lists.items() if k < len(own)}}
         for k, camera in enumerate(cameras)
     }
 

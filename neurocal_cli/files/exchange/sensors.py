@@ -10,7 +10,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import STILL, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, table
+from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
 from neurocal_cli.files.exchange.tree_paths import in_order
 from neurocal_cli.files.image_files import read_header
 from neurocal_cli.files.tree_fields import Field
@@ -88,7 +88,7 @@ def _streams(document: Document) -> list[re.Match[str]]:
     return list(_STREAM.finditer(document.text[:200_000])) or list(_PRINTED.finditer(document.text[:1000]))
 
 
-def _realsense_parts(document: Document) -> dict[str, Field]:
+def _realsense_parts(document: Document) -> dict[str, Tree]:
     parts = {}
     for found in _streams(document):
         size = [int(found["w"]), int(found["h"])]
@@ -103,7 +103,7 @@ def _realsense_parts(document: Document) -> dict[str, Field]:
         values = {key: found[key] for key in ("fx", "fy", "cx", "cy", "model")}
         name = found.groupdict().get("name") or "camera"
         tree = {**values, "D": k.tolist(), "size": size, "name": name}
-        parts[f"{name} {size[0]}x{size[1]}"] = Field(tree, document.source)
+        parts[f"{name} {size[0]}x{size[1]}"] = tree
     return parts
 
 
@@ -183,7 +183,7 @@ _KINECT = CameraKeys(
 _KINECT_ORDER = "cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1 rest:"
 
 
-def _kinect_parts(document: Document) -> dict[str, Field]:
+def _kinect_parts(document: Document) -> dict[str, Tree]:
     if document.size not in _KINECT_MODES:
         sizes = ", ".join(f"{width} {height}" for width, height in _KINECT_MODES)
         raise InputError(
@@ -204,7 +204,7 @@ def _kinect_parts(document: Document) -> dict[str, Field]:
             tree["cy"], tree["fy"] = 0.75 * tree["cy"] + 0.125, 0.75 * tree["fy"]
         tree |= {"fx": width * tree["fx"], "fy": height * tree["fy"]}
         tree |= {"cx": width * tree["cx"] - corner[0], "cy": height * tree["cy"] - corner[1]}
-        return {purpose.lower(): Field({**tree, "size": list(document.size)}, document.source)}
+        return {purpose.lower(): {**tree, "size": list(document.size)}}
     raise InputError(f"holds no camera of the purpose {purpose}; give another --image-size")
 
 
