@@ -18,7 +18,6 @@ from neurocal_cli.adjustment.residual_correlation import correlation, effective_
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.findings import (
-    CONTRADICTION,
     DISPLACED,
     ERROR,
     EXPLAINED,
@@ -268,6 +267,7 @@ def _steps(lin: Linearised, found: Estimate) -> Array:
 # wrong.
 _BIASED = Limit(2.0, 5.0)
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
+_LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
 
 
 def explains(contest: Contest, contradiction: float, error: float) -> bool:
@@ -279,7 +279,7 @@ def explains(contest: Contest, contradiction: float, error: float) -> bool:
     if error * left > ERROR.good < error:
         return False
     excess = 1.0 - contradiction**-2
-    return not (contradiction * left > CONTRADICTION.good and contest.explained < EXPLAINED * excess)
+    return not (contradiction * left > _LEFT and contest.explained < EXPLAINED * excess)
 
 
 def findings(contest: Contest, calibration: Calibration, given_told: bool) -> Iterator[Finding]:
