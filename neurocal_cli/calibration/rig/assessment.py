@@ -22,7 +22,7 @@ from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
 from neurocal_cli.calibration.rig.causes import EACH_PART, SAME_MOMENT, TAKEN, Named, named_cause
-from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, UNSYNCHRONISED
+from neurocal_cli.calibration.rig.consensus import NEIGHBOUR, PAIR_ANEW, SHIFTED, UNSYNCHRONISED
 from neurocal_cli.calibration.rig.edges import described, pair_name
 from neurocal_cli.calibration.rig.problem import ViewEquations
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
@@ -256,7 +256,7 @@ def _left_out(rig: Rig) -> Iterator[Finding]:
         )
     odd = {name: why for name, why in faults.items() if not why.startswith(TAKEN)}
     if odd:
-        shifted = any(why in SHIFTED.values() or why.startswith("fits the images") for why in odd.values())
+        shifted = any(why in SHIFTED.values() or why.startswith(NEIGHBOUR) for why in odd.values())
         yield (
             _LEFT_OUT.grade(len(odd) / n),
             f"{described(odd, n, kind)} and were left out",

@@ -60,6 +60,7 @@ PAIR_ANEW = (
     "moment alike"
 )
 SHIFTED = {word: f"the left image fits the right one of the {word} pair" for word in ("next", "previous")}
+NEIGHBOUR = "fits the images of the"  # next or previous frame, of a view in a rig of more than two
 OPPOSITE = {"next": "previous", "previous": "next"}
 
 Pair = tuple[str, str]

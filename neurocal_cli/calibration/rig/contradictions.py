@@ -24,7 +24,7 @@ from neurocal_cli.calibration.rig.causes import (
     Named,
     named_cause,
 )
-from neurocal_cli.calibration.rig.consensus import UNSYNCHRONISED
+from neurocal_cli.calibration.rig.consensus import NEIGHBOUR, UNSYNCHRONISED
 from neurocal_cli.calibration.rig.edges import MEDIAN, SUSPECT, described, pair_name
 from neurocal_cli.calibration.rig.frames import refuse_apart
 from neurocal_cli.calibration.rig.motion import timed
@@ -144,8 +144,11 @@ def _views(problem: RigProblem, chosen: Sequence[NDArray[np.bool_]]) -> list[tup
 
 
 def is_suspect(why: str) -> bool:
-    """Whether a view is only far from where the others see it, without a fault that has a name."""
-    return why == UNSYNCHRONISED
+    """Whether a view is only far from where the others see it, or fits those of the next or previous frame.
+
+    Such views may have a cause in common, as all images of a late camera have.
+    """
+    return why == UNSYNCHRONISED or why.startswith(NEIGHBOUR)
 
 
 def _suspects(left_out: Mapping[tuple[int, str], str]) -> set[tuple[int, str]]:

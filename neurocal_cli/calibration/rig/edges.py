@@ -25,6 +25,7 @@ from neurocal_cli.calibration.rig.consensus import (
     EXCHANGED,
     HYPOTHESES,
     LEAST_AGREED,
+    NEIGHBOUR,
     OPPOSITE,
     PAIR_ANEW,
     SHIFTED,
@@ -381,5 +382,5 @@ def _as_told(why: str, first: bool) -> str:
     """The fault of a pair as that of its first or its second view."""
     for word, text in SHIFTED.items():
         if why == text:
-            return f"fits the images of the {word if first else OPPOSITE[word]} frame"
+            return f"{NEIGHBOUR} {word if first else OPPOSITE[word]} frame"
     return why
