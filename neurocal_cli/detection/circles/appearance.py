@@ -26,10 +26,7 @@ _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second r
 # circles of 9 px and more, blurred by up to half of their radius; the second number is for circles that are
 # described, which may be smaller, blurred by a hand as far as they are wide, or holes of rings.
 _OFF = 0.05, 0.1  # of the distance to the next mark: from where those around a mark predict it (0.014)
-_UNEVEN = (
-    0.25,
-    0.25,
-)  # of the logarithm of the contrast from its change over the board (0.04; photographs 0.07)
+_UNEVEN = 0.25, 0.25  # of the logarithm of the contrast from a plane over the board (0.04; photographs 0.07)
 _LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
 _CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
 _SIGNED = 0.09, 0.09  # spread of the light within most marks beyond that around them (0.05; keys 0.12)
