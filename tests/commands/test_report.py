@@ -49,6 +49,14 @@ def test_a_calibration_shows_each_parameter_with_deviation_and_relative_deviatio
     assert row["t_z"] == ["t_z", "[mm]", "900.00", "0.50", "0.056", "%"]
 
 
+def test_a_deviation_beyond_the_value_is_a_plain_percentage() -> None:
+    calibration = made_calibration()
+    text = calibration_report(replace(calibration, std={**calibration.std, "u0": 605.0}))
+    value = calibration.camera.intrinsics.u0
+    (row,) = (line.split() for line in text.splitlines() if line.startswith("u0"))
+    assert row[-2:] == [f"{100 * 605.0 / value:.0f}", "%"]
+
+
 def test_given_parameters_are_marked_fixed() -> None:
     calibration = made_calibration()
     given = replace(

@@ -182,6 +182,18 @@ def test_things_in_rows_are_no_circles(kind: str, seed: int) -> None:
     assert seen_circles(no_boards.picture(kind, seed)) is None
 
 
+def test_circles_may_be_labelled() -> None:
+    image = np.full((960, 1280), 190, np.uint8)
+    for row in range(6):
+        for column in range(6):
+            cv2.circle(image, (290 + 110 * column, 190 + 110 * row), 38, (30,), -1, cv2.LINE_AA)
+    for label, (row, column) in enumerate([(1, 1), (1, 4), (3, 4), (4, 1)], 1):
+        at = (242 + 110 * column, 161 + 110 * row)
+        cv2.putText(image, str(label), at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, (30,), 2, cv2.LINE_AA)
+    seen = seen_circles(cv2.resize(cv2.GaussianBlur(image, (0, 0), 1.0), None, fx=0.5, fy=0.5))
+    assert seen is not None
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", no_boards.KINDS)
 def test_no_board_is_found_where_there_is_none(kind: str) -> None:

@@ -112,8 +112,9 @@ def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) 
     label = labelled(name, unit)
     if given:
         return [label, f"{value:.7g}", "fixed", ""]
-    relative = f"{100 * std / abs(value):.2g} %" if value != 0 and math.isfinite(std) else "-"
-    return [label, *rounded(value, std), relative]
+    share = 100 * std / abs(value) if value != 0 else math.inf
+    relative = f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %"
+    return [label, *rounded(value, std), relative if math.isfinite(share) else "-"]
 
 
 def _displacement_row(calibration: Calibration) -> list[str]:

@@ -30,6 +30,7 @@ _UNEVEN = 0.25, 0.25  # of the logarithm of the contrast from a plane over the b
 _LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
 _CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
 _SIGNED = 0.09, 0.09  # spread of the light within most marks beyond that around them (0.05; keys 0.12)
+_LABELLED = 1 / 8  # of the marks, beside which there may be ink
 _RULED = 0.015, 0.08  # change of the light in the paper between the marks (0.006; gaps between dice 0.025)
 
 
@@ -91,6 +92,10 @@ def _ruled(levels: Array, within: Array) -> float:
     """
     if not levels[0].size:
         return 0.0
+    # Numbers may label a few of the marks.
+    odd = np.where(within, np.abs(levels - np.median(levels, axis=0)), 0.0).max(axis=(1, 2))
+    plain = odd <= np.quantile(odd, 1 - _LABELLED)
+    levels, within = levels[plain], within[plain]
     count = np.maximum(within.sum(axis=0), 1)
     mean = np.where(within, levels, 0.0).sum(axis=0) / count
     # Lines between some of the marks are no noise.
