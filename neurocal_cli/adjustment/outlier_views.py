@@ -23,7 +23,8 @@ from neurocal_cli.camera.state import CameraState
 # none blamed) and test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
 _FEWEST = 4  # fewest views, so that the others outvote one
 _MOVES = 2.5  # leaving a view out must move some shared parameter by at least this many standard deviations
-_OUTLIER = 25.0  # times the contradiction that noise causes, and that of the other views
+OUTLIER = 25.0
+"""Least contradiction of an outlier view, times that which noise causes, and that of the other views."""
 _STEPS = 60
 # Steps of a view's own camera, from the common one. A flat view with distortion has a long valley: 60 steps
 # end up to 0.6 % above the rms error of hundreds of steps; one step and the minimum of its quadratic model
@@ -57,7 +58,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     variance = float(median(own / own_spare)) + 1e-24
     contradiction = _contradictions(quadratics, own, conditions) / variance
     view = int(np.argmax(contradiction))
-    if not contradiction[view] > _OUTLIER:
+    if not contradiction[view] > OUTLIER:
         return None
     rest = np.delete(np.arange(V), view)
     others = adjust(
@@ -65,7 +66,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     )
     left = reduced(others.normal, problem.free_of_prior, True)
     among = float(median(_contradictions(left, own[rest], conditions[rest]))) / variance
-    return views.names[view] if contradiction[view] > _OUTLIER * max(among, 1.0) else None
+    return views.names[view] if contradiction[view] > OUTLIER * max(among, 1.0) else None
 
 
 def _largest_move(q: Quadratics, variance: float) -> float:

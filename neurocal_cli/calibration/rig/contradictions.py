@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import solve_scaled
+from neurocal_cli.adjustment.outlier_views import OUTLIER
 from neurocal_cli.adjustment.reprojection import squared_errors
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
 from neurocal_cli.calibration.rig.causes import (
@@ -63,6 +64,9 @@ def without_contradictions(
         if held := suspects if common else suspects & set(_views(problem, fitting(still))):
             left_out = {view: why for view, why in left_out.items() if view not in held}
             fit, warnings = fitted()
+    if fit.problem.motion is not None and (odd := _odd_views(fit)):
+        left_out = left_out | dict.fromkeys(odd, UNSYNCHRONISED)
+        fit, warnings = fitted()
     for _ in names:
         found = named_cause(fit, names)[0]
         if found is None or found.cause not in TWO_GEOMETRIES:
@@ -175,15 +179,43 @@ def fitting(still: RigFit) -> list[NDArray[np.bool_]]:
 
     The linearised pose of a view of few points may seem far off, although the points fit the rig.
     """
-    problem, state = still.problem, still.state
-    more, views = np.zeros(len(problem.scale)), np.zeros(len(problem.scale))
-    for side, observed in enumerate(problem.observations):
-        cost = observed.weight * squared_errors(observed.views.batches, problem.camera(state, side))
-        more[observed.view] += cost - problem.own_normal[side][:, -1, -1]
-        views[observed.view] += 1
-    apart = more / np.maximum(views - 1, 1)
-    limit = SUSPECT * max(1.0, float(median(apart[problem.together])) / MEDIAN)
-    return [apart[observed.view] < limit for observed in problem.observations]
+    apart = _times_most(still.problem, _beyond_alone(still))
+    return [apart[observed.view] < SUSPECT / MEDIAN for observed in still.problem.observations]
+
+
+def _odd_views(fit: RigFit) -> list[tuple[int, str]]:
+    """Views that the delays of the cameras do not explain, as the target moves unevenly in their frame.
+
+    Of each frame it is the one with the largest error; of two views, neither can be told from the other.
+    """
+    problem, more = fit.problem, _beyond_alone(fit)
+    apart, worst = _times_most(problem, more), np.full(len(problem.scale), -np.inf)
+    sides = [(observed.view, own) for observed, own in zip(problem.observations, more, strict=True)]
+    for view, own in sides:
+        worst[view] = np.maximum(worst[view], own)
+    odd = [
+        (apart[view] > OUTLIER) & ((problem.n_views[view] == 2) | (own == worst[view])) for view, own in sides
+    ]
+    return _views(problem, odd)
+
+
+def _beyond_alone(fit: RigFit) -> list[Array]:
+    """(V_c,) squared errors of the views of each camera, less those in this camera alone."""
+    problem = fit.problem
+    return [
+        observed.weight * squared_errors(observed.views.batches, problem.camera(fit.state, side))
+        - problem.own_normal[side][:, -1, -1]
+        for side, observed in enumerate(problem.observations)
+    ]
+
+
+def _times_most(problem: RigProblem, more: Sequence[Array]) -> Array:
+    """(V,) what the views of each frame have beyond each camera alone, over that of most frames and noise."""
+    squares = np.zeros(len(problem.scale))
+    for observed, own in zip(problem.observations, more, strict=True):
+        squares[observed.view] += own
+    apart = squares / np.maximum(problem.n_views - 1, 1)
+    return np.asarray(apart / max(float(median(apart[problem.together])), MEDIAN))
 
 
 def is_common(found: Named, still: RigFit, fit: RigFit, n: int) -> bool:

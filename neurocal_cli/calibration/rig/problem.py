@@ -178,10 +178,15 @@ class RigProblem:
         return tuple(observed.views.names for observed in self.observations)
 
     @cached_property
+    def n_views(self) -> NDArray[np.intp]:
+        """(V,) of each frame."""
+        views = np.concatenate([observed.view for observed in self.observations])
+        return np.bincount(views, minlength=len(self.scale))
+
+    @cached_property
     def together(self) -> NDArray[np.bool_]:
         """(V,) frames of several cameras, which have their pose in the first camera of the rig."""
-        views = np.concatenate([observed.view for observed in self.observations])
-        return np.bincount(views, minlength=len(self.scale)) > 1
+        return self.n_views > 1
 
     @property
     def estimated(self) -> tuple[NDArray[np.bool_], ...]:
