@@ -176,13 +176,14 @@ def test_squares_in_a_grid_are_no_circles(side: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("dice", 20), ("lamps", 3), ("bottles", 4), ("pieces", 33), ("polygons", 13)]
+    ("kind", "seed"),
+    [("dice", 20), ("lamps", 3), ("bottles", 4), ("pieces", 33), ("pieces", 205), ("polygons", 13)],
 )
 def test_things_in_rows_are_no_circles(kind: str, seed: int) -> None:
     assert seen_circles(no_boards.picture(kind, seed)) is None
 
 
-def test_circles_may_be_labelled() -> None:
+def test_circles_may_be_labelled_and_sharpened() -> None:
     image = np.full((960, 1280), 190, np.uint8)
     for row in range(6):
         for column in range(6):
@@ -190,8 +191,10 @@ def test_circles_may_be_labelled() -> None:
     for label, (row, column) in enumerate([(1, 1), (1, 4), (3, 4), (4, 1)], 1):
         at = (242 + 110 * column, 161 + 110 * row)
         cv2.putText(image, str(label), at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, (30,), 2, cv2.LINE_AA)
-    seen = seen_circles(cv2.resize(cv2.GaussianBlur(image, (0, 0), 1.0), None, fx=0.5, fy=0.5))
-    assert seen is not None
+    seen = cv2.resize(cv2.GaussianBlur(image, (0, 0), 1.0), None, fx=0.5, fy=0.5)
+    assert seen_circles(seen) is not None
+    sharpened = cv2.addWeighted(seen, 2.0, cv2.GaussianBlur(seen, (0, 0), 1.0), -1.0, 0.0)
+    assert seen_circles(sharpened) is not None
 
 
 @pytest.mark.slow

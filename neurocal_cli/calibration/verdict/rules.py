@@ -325,7 +325,9 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
 
     given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
     linear = np.linalg.lstsq(given, found, rcond=None)[0]
-    stretch, lean = (stretches(given) * linear).sum(axis=(1, 2)).tolist()
+    sides = stretches(given)
+    stretch, lean = (sides * linear).sum(axis=(1, 2)).tolist()
+    longer, other = ("XYZ"[k(stretch * np.diag(sides[0]))] for k in (np.argmax, np.argmin))
     if "theta" not in calibration.fixed and abs(lean) > _MISPRINT:
         yield (
             1,
@@ -336,8 +338,8 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
     measure = "measure the target along both sides, and give its true size"
     yield (
         STRETCHED_PRINT.grade(abs(stretch)),
-        f"the target is {100 * abs(stretch):.2g} % {'longer' if stretch > 0 else 'shorter'} along its "
-        f"longer side, compared with the other one, than described: {WRONG_PRINT}",
+        f"the target is {100 * abs(stretch):.2g} % longer along {longer}, compared with {other}, "
+        f"than described: {WRONG_PRINT}",
         measure,
     )
     plane = np.linalg.svd(given, full_matrices=False)[2][:2]

@@ -17,8 +17,10 @@ from neurocal_cli.detection.markers.lattice import flattening_of, predicted
 _RAYS = 16
 _FIRST, _STEP = 0.3, 0.05  # of the radius, from where on the light is looked at on rings
 _INSIDE, _AROUND = 2, 1.5  # the ring of 0.4, within all marks, and the radius up to which a mark ends
+_NEIGHBOURS = 1.5  # distances to the next mark, within which marks are around one
 _NEXT = 0.54  # of the distance to the next mark, of the last ring
 _BLUR = 2.5  # standard deviations of the blur from the edge to where the paper is blank
+_SHARP = 0.15  # of the radius: of an edge less blurred, a small displacement is a large change of light
 _SURE = 4.0  # standard deviations of the noise
 _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second row is shifted
 
@@ -26,7 +28,7 @@ _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second r
 # circles of 9 px and more, blurred by up to half of their radius; the second number is for circles that are
 # described, which may be smaller, blurred by a hand as far as they are wide, or holes of rings.
 _OFF = 0.05, 0.1  # of the distance to the next mark: from where those around a mark predict it (0.014)
-_UNEVEN = 0.25, 0.25  # of the logarithm of the contrast from a plane over the board (0.04; photographs 0.07)
+_UNEVEN = 0.035, 0.25  # of the log of the contrast from that around, of a third (0.015; photographs 0.03)
 _LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
 _CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
 _SIGNED = 0.09, 0.09  # spread of the light within most marks beyond that around them (0.05; keys 0.12)
@@ -61,9 +63,10 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     outer = middle + int(np.abs(profile[middle : edge + 1] - profile[inner]).argmax())
     ring = np.median(levels, axis=2)
     contrast = ring[:, outer] - ring[:, inner]
-    ground = np.column_stack([np.ones(len(places)), places])
     amount = np.log(np.maximum(np.abs(contrast), 1.0))
-    uneven = float((amount - ground @ np.linalg.lstsq(ground, amount, rcond=None)[0]).std())
+    next_to = (away > 0) & (away < _NEIGHBOURS * apart)
+    # A shadow's edge changes those of the marks that it passes.
+    uneven = float(np.quantile(np.abs(amount - next_to @ amount / next_to.sum(axis=1)), 1 / 3))
     levels -= ring[:, inner, None, None]
     levels /= np.where(np.abs(contrast) < 1, 1.0, contrast)[:, None, None]
     mean = levels.mean(axis=0)
@@ -80,7 +83,8 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     paper = (rings > blank) & (rings < apart - blank)
     at = places[:, None, None] + shift[paper]
     within = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
-    found = uneven, long, max(corners), signed, _ruled(levels[:, paper], within)
+    cornered = max(corners) * min(1.0, blur / (_SHARP * radius))
+    found = uneven, long, cornered, signed, _ruled(levels[:, paper], within)
     limits = _UNEVEN, _LONG, _CORNERED, _SIGNED, _RULED
     return all(one <= most[described] for one, most in zip(found, limits, strict=True))
 
