@@ -205,3 +205,7 @@ def neurocal(quiet: int, verbose: bool) -> None:
     if quiet and verbose:
         raise UsageError("--quiet and --verbose contradict each other; give one of them")
     set_verbosity(-quiet if quiet else int(verbose))
+    # The matrices are small: threads cost three times the time that they save, and their number would change
+    # the last digits. NumPy looks once, when it is loaded. The user's own setting takes precedence.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        os.environ.setdefault(name, "1")

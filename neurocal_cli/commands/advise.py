@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.preparation import plot_option, write_plot
+from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.streams import ProgressBar, answer, suggest
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @options.count("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
 @plot_option("the outlines of these views")
 @options.json
-def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
+def advise(calibration: str, count: int, plots: Plots, as_json: bool) -> None:
     """Advise which views of the target to photograph next.
 
     The command compares about 900 views that show the whole target: 25 positions in the image, 3 distances,
@@ -45,12 +45,12 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal rig sample_data/rig_cam*.csv -o rig.yaml
       neurocal advise rig.yaml --next 1
     """  # noqa: D301 - as in the group
-    preparation.check((calibration,), plots=(plot,))
+    preparation.check((calibration,), plots=plots)
     from neurocal_cli.files.camera_tree import own_kind, read_tree
 
     root = read_tree(calibration)
     if own_kind(root) in ("stereo", "rig"):
-        _advise_rig(root, count, plot, as_json)
+        _advise_rig(root, count, plots, as_json)
         return
     from neurocal_cli.calibration.advice import advise as weigh
     from neurocal_cli.commands.show.advice import advice_json, advice_lines, draw_advice
@@ -60,14 +60,14 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     with ProgressBar("comparing views"):
         advice = weigh(known, count)
     answer(as_json, lambda: advice_json(advice), lambda: "\n".join(advice_lines(advice, known.verdict)))
-    write_plot(plot, draw_advice, advice, known)
-    if plot is not None:
+    write_plots(plots, draw_advice, advice, known)
+    if plots:
         suggest(calibration, "photograph these views, and calibrate from all images")
     elif not as_json:
         suggest(calibration, "neurocal advise {} --plot next.png")
 
 
-def _advise_rig(root: Field, count: int, plot: str | None, as_json: bool) -> None:
+def _advise_rig(root: Field, count: int, plots: Plots, as_json: bool) -> None:
     """Advise views that tie the cameras of a rig."""
     from neurocal_cli.calibration.rig.advice import advise_rig
     from neurocal_cli.commands.show.advice import draw_rig_advice, rig_advice_json, rig_advice_lines
@@ -77,4 +77,4 @@ def _advise_rig(root: Field, count: int, plot: str | None, as_json: bool) -> Non
     with ProgressBar("comparing views"):
         advice = advise_rig(rig, count)
     answer(as_json, lambda: rig_advice_json(advice), lambda: "\n".join(rig_advice_lines(advice)))
-    write_plot(plot, draw_rig_advice, advice, rig)
+    write_plots(plots, draw_rig_advice, advice, rig)

@@ -119,7 +119,6 @@ def batch(
       # neurocal batch sample_data/fleet.csv --scheduler tcp://host:8786 \\
       #     --ship -o third
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
     ways = {"--workers": workers, "--jobs": jobs, "--scheduler": scheduler}
     chosen = [name for name, value in ways.items() if value]
     if len(chosen) > 1:

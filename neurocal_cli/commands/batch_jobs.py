@@ -27,7 +27,7 @@ Words = tuple[str, ...]
 LOG = "log.txt"
 _REPORT = "report.html"
 # Options that a batch decides itself.
-_OWN = {"output", "html", "plot", "plots", "as_json", "jobs", "overlay", "cache", "watch", "ros", "points"}
+_OWN = {"output", "html", "plots", "as_json", "jobs", "overlay", "cache", "watch", "ros", "points"}
 _RENAMED = {"measure": "--points"}  # of detect, whose name is that of a source
 _YES, _NO = ("yes", "true", "1", "on"), ("no", "false", "0", "off")
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.commands import preparation
 from neurocal_cli.commands.batch_jobs import LOG, Job, Outcome, Words, parsed
 from neurocal_cli.commands.show.fleet import rows_of
 from neurocal_cli.commands.streams import captured, one_line, tell
@@ -59,7 +58,6 @@ class Task:
 
 def do_job(task: Task) -> Outcome:
     """Do a job, unless its results are those of the same commands, inputs and version."""
-    preparation.compute_in_one_thread()
     with _ONE_AT_A_TIME:
         try:
             return Context().run(_done if task.shipped is None else _done_elsewhere, task)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import boards, options, preparation
-from neurocal_cli.commands.preparation import plot_option, write_plot
+from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.streams import print_summary, say, suggest, warn
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.files.writing import write_whole
@@ -130,7 +130,7 @@ def board(
 @plot_option("the heights of the board's points and their shifts")
 @options.summary
 @options.output("BOARD.yaml", "Write the board to this file.")
-def target(camera: str, file: str | None, plot: str | None, as_json: bool, output: str) -> None:
+def target(camera: str, file: str | None, plots: Plots, as_json: bool, output: str) -> None:
     """Write the board with its estimated shape.
 
     No board is exactly as its file says: paper curls, and printers stretch. `neurocal calibrate --target
@@ -148,7 +148,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
       neurocal target camera.yaml --board chessboard:9x6:25 -o again.yaml
     """  # noqa: D301 - as in the group
-    preparation.check((camera, file), (output,), plots=(plot,), as_json=as_json)
+    preparation.check((camera, file), (output,), plots=plots, as_json=as_json)
     from neurocal_cli.commands.show.camera_panels import draw_target
     from neurocal_cli.commands.show.camera_report import target_json, target_lines
     from neurocal_cli.files.board_yaml import read_board, write_board
@@ -161,7 +161,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
             f"{camera}: the target was taken as it was given, so its own file still holds; if it may have "
             "another shape, calibrate with --target free"
         )
-    write_plot(plot, draw_target, calibration.target, calibration.unit)
+    write_plots(plots, draw_target, calibration.target, calibration.unit)
     known = calibration.target, calibration.unit, calibration.points.distances
     described = None
     if file is not None:

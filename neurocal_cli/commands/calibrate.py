@@ -6,7 +6,7 @@ import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.preparation import Plots, files_of, panel_option, write_plots
+from neurocal_cli.commands.preparation import Plots, plot_option, plot_result
 from neurocal_cli.commands.report import html_option, write_page
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.streams import ProgressBar, concluding, suggest, warn
@@ -19,7 +19,7 @@ _STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 @estimation_options()
 @boards.board_of_corners
 @options.camera_name
-@panel_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
+@plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option
 @options.lean
 @options.summary
@@ -82,11 +82,9 @@ def calibrate(
       neurocal calibrate corners.vnl --board chessboard:9x6:25 -o vnl.yaml
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
     estimation.check()
     inputs = *points, estimation.intrinsics, estimation.extrinsics
-    options.check_camera_name(camera_name)
-    preparation.check((*inputs, board), (output, html), plots=files_of(plots), as_json=as_json)
+    preparation.check((*inputs, board), (output, html), plots=plots, as_json=as_json)
     given, arguments = estimation.prepare(preparation.given_points(*points, board=board))
 
     from neurocal_cli.calibration.calibrate import calibrate as learn
@@ -98,11 +96,7 @@ def calibrate(
     with concluding(calibration, as_json, calibration_json, calibration_report):
         if not preparation.is_for_the_eye(output, "camera.yaml"):
             warn(*write_result(calibration, output, lean=lean))
-        if plots:
-            from neurocal_cli.commands.show.camera_panels import Subject
-            from neurocal_cli.commands.show.plot_pages import draw_camera
-
-            write_plots(plots, draw_camera, Subject.of(calibration))
+        plot_result(plots, calibration)
         write_page(html, calibration, *inputs)
         verdict, distorted = calibration.verdict, not calibration.camera.distortion.is_identity
         if html is None:

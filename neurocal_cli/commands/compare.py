@@ -83,7 +83,6 @@ def compare(
           --image-size 640 480 --seed 1 --json
     """  # noqa: D301 - as in the group
     preparation.check((points, right))
-    preparation.compute_in_one_thread()
     given = [preparation.given_points(name) for name in (points, right) if name is not None]
     if image_size is not None:
         given = [replace(one, image_size=image_size) for one in given]

@@ -171,7 +171,6 @@ def detect(
     preparation.check_summary(as_json, output)
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
-    preparation.compute_in_one_thread()
     if cache is not None:
         preparation.check_folder("--cache", cache)
     described, enough = described_board(board), 1 if watch is None else _ENOUGH

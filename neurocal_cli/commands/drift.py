@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.preparation import plot_option, write_plot
+from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.streams import answer, note
 from neurocal_cli.errors import FormatError, InputError
 
@@ -29,7 +29,7 @@ _DIFFERENT = 4  # exit status
 @options.argument("new", "NEW.yaml", "The later calibration of the same camera or rig.")
 @plot_option("the differences over the image, in pixels and in standard deviations,")
 @options.json
-def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
+def drift(old: str, new: str, plots: Plots, as_json: bool) -> None:
     """Tell whether a camera or a rig has changed since an earlier calibration.
 
     The new camera projects the rays of the old camera's pixels. A rotation between the two is fitted first,
@@ -54,70 +54,42 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv -o rig.yaml
       neurocal drift rig.yaml rig.yaml
     """  # noqa: D301 - as in the group
-    preparation.check((old, new), plots=(plot,))
-    from neurocal_cli.calibration.drift import find_drift
+    preparation.check((old, new), plots=plots)
+    from neurocal_cli.calibration.drift import SHARE, find_drift
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.rig_drift import find_rig_drift
     from neurocal_cli.camera.camera import camera_of
-    from neurocal_cli.commands.show.drift_report import (
-        details_json,
-        draw_drift,
-        drift_json,
-        drift_lines,
-        drift_tables,
-    )
+    from neurocal_cli.commands.show import drift_report as show
     from neurocal_cli.commands.show.text import tabulated
 
     before, after = _read(old), _read(new)
-    if isinstance(before, Rig) or isinstance(after, Rig):
-        _compare_rigs(before, after, plot, as_json)
-        return
-    found = find_drift(before, after)
-    if plot is not None:
-        size = before.image_size or after.image_size
-        assert size is not None
-        write_plot(plot, draw_drift, {"": (found, size)})
-    models = [camera_of(camera).model for camera in (before, after)]
-    if found.different and models[0] != models[1]:
-        note(
-            f"the distortion models differ ({models[0]} and {models[1]}), which may be all that changed; "
-            "calibrate both with the same --distortion"
+    if isinstance(before, Rig) and isinstance(after, Rig):
+        rigs = find_rig_drift(before, after)
+        found, limit, different = rigs.cameras, rigs.limit, rigs.different
+        sizes = {name: before.cameras[name].image_size or after.cameras[name].image_size for name in found}
+        answer(
+            as_json,
+            lambda: show.rig_drift_json(rigs),
+            lambda: tabulated(show.rig_drift_tables(rigs), show.rig_drift_lines(rigs)),
         )
-    answer(
-        as_json,
-        lambda: drift_json(found) | details_json(before, after, found),
-        lambda: tabulated(drift_tables(before, after, found), drift_lines(found)),
-    )
-    if found.different:
-        click.get_current_context().exit(_DIFFERENT)
-
-
-def _compare_rigs(
-    old: Calibration | Camera | Rig, new: Calibration | Camera | Rig, plot: str | None, as_json: bool
-) -> None:
-    """Compare two rigs; the exit status is that of the answer."""
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.rig_drift import find_rig_drift
-    from neurocal_cli.commands.show.drift_report import (
-        draw_drift,
-        rig_drift_json,
-        rig_drift_lines,
-        rig_drift_tables,
-    )
-    from neurocal_cli.commands.show.text import tabulated
-
-    if not (isinstance(old, Rig) and isinstance(new, Rig)):
+    elif isinstance(before, Rig) or isinstance(after, Rig):
         raise InputError("one file is a rig and the other one camera; give two of a kind")
-    found = find_rig_drift(old, new)
-    if plot is not None:
-        sizes = {name: old.cameras[name].image_size or new.cameras[name].image_size for name in found.cameras}
-        panels = {name: (one, sizes[name]) for name, one in found.cameras.items()}
-        write_plot(plot, draw_drift, panels, found.limit)
-    answer(
-        as_json,
-        lambda: rig_drift_json(found),
-        lambda: tabulated(rig_drift_tables(found), rig_drift_lines(found)),
-    )
-    if found.different:
+    else:
+        one, limit = find_drift(before, after), SHARE
+        found, different, sizes = {"": one}, one.different, {"": before.image_size or after.image_size}
+        models = [camera_of(camera).model for camera in (before, after)]
+        if different and models[0] != models[1]:
+            note(
+                f"the distortion models differ ({models[0]} and {models[1]}), which may be all that changed; "
+                "calibrate both with the same --distortion"
+            )
+        answer(
+            as_json,
+            lambda: show.drift_json(one) | show.details_json(before, after, one),
+            lambda: tabulated(show.drift_tables(before, after, one), show.drift_lines(one)),
+        )
+    write_plots(plots, show.draw_drift, {name: (found[name], sizes[name]) for name in found}, limit)
+    if different:
         click.get_current_context().exit(_DIFFERENT)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.preparation import Plots, files_of, panel_option, write_plots
+from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.streams import answer, first_of, note, suggest, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
@@ -117,7 +117,7 @@ def _at_option(what: str) -> Callable[[options.F], options.F]:
 )
 @_at_option("lengths and points are measured on a plane")
 @options.flag("--positions", "Also say where the camera was in each view, in the coordinates of the target.")
-@panel_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
+@plot_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
 def camera(
     calibration: str, points: str | None, at: Distance | None, positions: bool, plots: Plots, as_json: bool
@@ -156,7 +156,7 @@ def camera(
           --plot uncertainty=trust.pdf
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
-    preparation.check((calibration, points), plots=files_of(plots))
+    preparation.check((calibration, points), plots=plots)
     given = None if points is None else preparation.given_points(points)
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.drift import drift_since
@@ -244,7 +244,7 @@ def camera(
     default="optimal",
 )
 @_at_option("points and lengths are triangulated")
-@panel_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
+@plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
     cameras: tuple[str, ...],
@@ -297,7 +297,7 @@ def stereo(
             f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
         )
     inputs = *cameras, *(points or ())
-    preparation.check(inputs, plots=files_of(plots))
+    preparation.check(inputs, plots=plots)
     given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
     if at is not None and rig is None:

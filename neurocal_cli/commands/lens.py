@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.preparation import plot_option, write_plot
+from neurocal_cli.commands.preparation import Plots, plot_option, plot_result, write_plots
 from neurocal_cli.commands.streams import (
     ProgressBar,
     answer,
@@ -112,7 +112,7 @@ def fit(
     no_skew: bool,
     target: str,
     seed: int,
-    plot: str | None,
+    plots: Plots,
     as_json: bool,
     output: str,
 ) -> None:
@@ -142,10 +142,9 @@ def fit(
       neurocal lens fit sample_data/zoom.csv --hidden 2 2 --outliers keep --seed 1 \\
           --target given --json -o lens.yaml
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
-    preparation.check(points, (output,), plots=(plot,), as_json=as_json)
+    preparation.check(points, (output,), plots=plots, as_json=as_json)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
-    from neurocal_cli.commands.show.zoom_report import draw_lens, lens_json, lens_report
+    from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
     from neurocal_cli.files.lens_files import read_lens_data, write_lens
 
     data = noted(read_lens_data, points)
@@ -170,7 +169,7 @@ def fit(
     with concluding(learnt, as_json, lens_json, lens_report):
         if not preparation.is_for_the_eye(output, "lens.yaml"):
             write_lens(learnt, output)
-        write_plot(plot, draw_lens, learnt)
+        plot_result(plots, learnt)
         settings = " ".join(f"--{name} {name[0].upper()}" for name in learnt.controls)
         suggest(output, f"neurocal lens camera {{}} {settings} -o camera.yaml")
 
@@ -207,8 +206,6 @@ def camera(
       neurocal lens camera lens.yaml --zoom 3100 --focus 400 --extrapolate \\
           --camera-name tele --json -o tele.yaml
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
-    options.check_camera_name(camera_name)
     preparation.check((lens_file,), (output,), as_json=as_json)
     from neurocal_cli.calibration.zoom.zoom_lens import camera_at
     from neurocal_cli.files.lens_files import read_lens
@@ -242,7 +239,7 @@ def camera(
 )
 @plot_option("the error over the settings, and the errors of the baseline models")
 @options.json
-def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool) -> None:
+def evaluate(lens_file: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a zoom lens.
 
     The error is compared with that of baseline models. These are fitted to the data that the lens was
@@ -262,38 +259,28 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --plot errors.png
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --json
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
-    preparation.check((lens_file, points), plots=(plot,))
-    if points is None:
-        if plot is not None:
-            raise UsageError("--plot shows the errors at points; give POINTS.csv")
-        _judge(lens_file, as_json)
-        return
+    preparation.check((lens_file, points), plots=plots)
+    if points is None and plots:
+        raise UsageError("--plot shows the errors at points; give POINTS.csv")
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.judgement import judge_lens
-    from neurocal_cli.commands.show.zoom_report import draw_evaluation, evaluation_json, evaluation_report
+    from neurocal_cli.commands.show import zoom_report as show
     from neurocal_cli.files.lens_files import read_lens, read_lens_points
 
     learnt = read_lens(lens_file)
+    if points is None:  # as `fit` shows it
+        answer(as_json, lambda: show.lens_json(learnt), lambda: show.lens_report(learnt))
+        warn(*learnt.warnings)
+        suggest(lens_file, "neurocal lens evaluate {} POINTS.csv", "neurocal report {} -o report.html")
+        return
     data = noted(read_lens_points, points)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     answer(
         as_json,
-        lambda: evaluation_json(evaluation, verdict),
-        lambda: evaluation_report(evaluation, learnt.controls, verdict),
+        lambda: show.evaluation_json(evaluation, verdict),
+        lambda: show.evaluation_report(evaluation, learnt.controls, verdict),
     )
     warn(*evaluation.warnings)
-    write_plot(plot, draw_evaluation, evaluation, learnt.controls)
+    write_plots(plots, show.draw_evaluation, evaluation, learnt.controls)
     suggest(lens_file, "neurocal report {} -o report.html")
-
-
-def _judge(lens_file: str, as_json: bool) -> None:
-    """Show a lens with its verdict, as `fit` does."""
-    from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
-    from neurocal_cli.files.lens_files import read_lens
-
-    learnt = read_lens(lens_file)
-    answer(as_json, lambda: lens_json(learnt), lambda: lens_report(learnt))
-    warn(*learnt.warnings)
-    suggest(lens_file, "neurocal lens evaluate {} POINTS.csv", "neurocal report {} -o report.html")

@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import wraps
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -21,9 +21,6 @@ from click.types import FloatParamType
 from neurocal_cli.commands.streams import HelpContext, note
 from neurocal_cli.errors import FormatError, UsageError, plural
 from neurocal_cli.files.reading import detect_line
-
-if TYPE_CHECKING:
-    pass
 
 F = TypeVar("F", bound=Callable[..., Any])
 Named = tuple[tuple[str, str], ...]  # values of an option NAME=VALUE that can be repeated
@@ -395,31 +392,37 @@ def check_ending() -> None:
             raise UsageError(f"-o {name} would hold {_TEXTS[ending]}; give a name such as {instead}")
 
 
+def _storable(ctx: click.Context, param: click.Parameter, name: str) -> str:
+    """A name that can be stored in a file."""
+    if not name.strip() or not name.isprintable():
+        raise UsageError("--camera-name must hold printable characters only; give another name")
+    return name
+
+
 camera_name = click.option(
-    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
+    "--camera-name",
+    metavar="NAME",
+    default="camera",
+    callback=_storable,
+    help="Name of the camera in the output file.",
 )
 
 
-def check_camera_name(name: str) -> None:
-    """Refuse a name that cannot be stored in a file, with a UsageError."""
-    if not name.strip() or not name.isprintable():
-        raise UsageError("--camera-name must hold printable characters only; give another name")
-
-
 def alpha(default: str) -> Callable[[F], F]:
-    """Add ``--alpha``, the part of the original images that is shown; see `check_alpha`."""
+    """Add ``--alpha``, the part of the original images that is shown."""
+
+    def parse(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+        if value is not None and not 0 <= value <= 1:
+            raise UsageError(f"--alpha is {value:g}; give a number from 0 to 1")
+        return value
+
     return number(
         "--alpha",
         "ALPHA",
         "Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
         without=default,
+        callback=parse,
     )
-
-
-def check_alpha(alpha: float | None) -> None:
-    """Refuse an alpha outside 0 to 1, with a UsageError."""
-    if alpha is not None and not 0 <= alpha <= 1:
-        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
 
 
 def methods(default: str) -> Callable[[F], F]:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -22,6 +21,7 @@ from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back, wr
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
@@ -35,16 +35,16 @@ def check(
     inputs: Iterable[str | None],
     outputs: Iterable[str | None] = (),
     *,
-    plots: Iterable[str | None] = (),
+    plots: Plots = (),
     as_json: bool = False,
 ) -> None:
     """Refuse what cannot be read, drawn or written, before any work is done."""
-    inputs, outputs, plots = tuple(inputs), tuple(outputs), tuple(plots)
+    inputs, outputs, pictures = tuple(inputs), tuple(outputs), [file for _, file in plots]
     check_one_stdin(*inputs)
     check_summary(as_json, *outputs)
-    for plot in plots:
-        check_plot(plot)
-    check_outputs((*outputs, *plots), inputs)
+    for picture in pictures:
+        _check_plot(picture)
+    check_outputs((*outputs, *pictures), inputs)
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
@@ -87,16 +87,6 @@ def check_summary(as_json: bool, *outputs: str | None) -> None:
     """Refuse a summary and a result on one stream, with a UsageError."""
     if as_json and not STDOUT_NAMES.isdisjoint(outputs):
         raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")
-
-
-def compute_in_one_thread() -> None:
-    """Limit the linear algebra to one thread, for this process and those it starts.
-
-    The matrices are small: threads cost three times the time that they save, and their number would change
-    the last digits. It must be set before numpy is loaded. The user's own setting takes precedence.
-    """
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def given_points(*names: str, board: str | None = "") -> Correspondences:
@@ -177,19 +167,17 @@ def warn_of_poor(rig: StereoRig | Rig, so: str = "") -> None:
         warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
 
 
-def plot_option(what: str) -> Callable[[F], F]:
-    """Add ``--plot``, a picture of the result; see `check_plot`."""
-    return options.path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
+def plot_option(what: str, panels: Sequence[str] = ()) -> Callable[[F], F]:
+    """Add ``--plot``, pictures of the result; if it has panels, of all on a page or of one of them.
 
+    A command gets it as its keyword ``plots``, of the type `Plots`.
+    """
 
-def panel_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
-    """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
-
-    def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
+    def parse(ctx: click.Context, param: click.Parameter, given: tuple[str, ...] | str | None) -> Plots:
         plots: list[tuple[str | None, str]] = []
-        for word in words:
+        for word in (given,) if isinstance(given, str) else given or ():
             panel, equals, file = word.partition("=")
-            if equals and panel.isalpha() and panel not in panels:
+            if panels and equals and panel.isalpha() and panel not in panels:
                 raise click.BadParameter(
                     f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a "
                     "file of this name"
@@ -197,42 +185,38 @@ def panel_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
             plots.append((panel, file) if equals and panel in panels else (None, word))
         return tuple(plots)
 
+    each = f": all panels on one page, or one of them: {', '.join(panels)}. It can be repeated"
     return click.option(
         "--plot",
         "plots",
-        metavar="[PANEL=]FILE.png",
-        multiple=True,
+        metavar="[PANEL=]FILE.png" if panels else "FILE.png",
+        type=options.PATH,
+        multiple=bool(panels),
         callback=parse,
         show_default="none",
-        help=f"Plot {what} to this .png, .pdf or .svg file: all panels on one page, or one of them: "
-        f"{', '.join(panels)}. It can be repeated.",
+        help=f"Plot {what} to this .png, .pdf or .svg file{each if panels else ''}.",
     )
 
 
-def check_plot(plot: str | None) -> None:
+def plot_result(plots: Plots, result: Calibration | StereoRig | Rig | ZoomLens) -> None:
+    """Draw and write all pictures of a result; its modules are loaded only if there are any."""
+    if plots:
+        from neurocal_cli.commands.show.results import plot
+
+        write_plots(plots, plot, result)
+
+
+def _check_plot(plot: str) -> None:
     """Refuse a picture that cannot be drawn, before any work is done."""
-    if plot is None:
-        return
     if not plot.lower().endswith(_PICTURES):
         endings = options.one_of(" ".join(_PICTURES))
         raise UsageError(f"--plot {plot}: not a picture file; give a name that ends in {endings}")
     check_available()
 
 
-def files_of(plots: Plots) -> list[str]:
-    """The files of pictures."""
-    return [file for _, file in plots]
-
-
 def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:
-    """Draw and write all pictures of a subject; see `write_plot`."""
+    """Draw and write all pictures of a subject, each of the `kind` that its name ends in."""
     for panel, file in plots:
-        write_plot(file, partial(draw, panel=panel), *subject)
-
-
-def write_plot(file: str | None, draw: Callable[..., bytes], *subject: Any) -> None:
-    """Draw and write a picture of a subject, of the `kind` that its name ends in, unless there is none."""
-    if file is None:
-        return
-    with ProgressBar(f"drawing {file}"):
-        write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
+        only = {} if panel is None else {"panel": panel}
+        with ProgressBar(f"drawing {file}"):
+            write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower(), **only))

@@ -98,7 +98,6 @@ def rectify(
       neurocal rectify three.yaml --cameras rig_cam0 rig_cam2 --maps -o maps
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(rig, *files)
-    options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     preparation.check_folder("-o", output)

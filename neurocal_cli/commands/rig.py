@@ -10,14 +10,7 @@ import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.preparation import (
-    Plots,
-    files_of,
-    panel_option,
-    plot_option,
-    write_plot,
-    write_plots,
-)
+from neurocal_cli.commands.preparation import Plots, plot_option, plot_result
 from neurocal_cli.commands.report import html_option, write_page
 from neurocal_cli.commands.show import RIG_PANELS
 from neurocal_cli.commands.streams import ProgressBar, concluding, note, noted, suggest, warn
@@ -84,7 +77,7 @@ def rig(
     models: options.Named,
     board: str | None,
     estimation: Estimation,
-    plot: str | None,
+    plots: Plots,
     html: str | None,
     lean: bool,
     as_json: bool,
@@ -135,7 +128,6 @@ def rig(
       neurocal rig sample_data/rig_cam*.csv --trainer backprop --epochs 20000 --rate 0.05 \\
           --rate-gamma 0.4 -o rig.yaml
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
     if estimation.type in ("3", "4"):
         raise UsageError(
             f"--type {estimation.type} is for one camera; give known cameras by --intrinsics NAME=CAMERA.yaml"
@@ -144,9 +136,8 @@ def rig(
     named = [named_file(file) for file in files]
     inputs = [file for _, file in named]
     read = *inputs, board, *(file for _, file in known)
-    preparation.check(read, (output, html), plots=(plot,), as_json=as_json)
+    preparation.check(read, (output, html), plots=plots, as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-    from neurocal_cli.commands.show.plot_pages import draw_rig
     from neurocal_cli.commands.show.rig_report import rig_json, rig_report
     from neurocal_cli.files.result_files import write_result
     from neurocal_cli.files.rig_points import read_rig_points
@@ -170,7 +161,7 @@ def rig(
     with concluding(found, as_json, rig_json, rig_report):
         if not preparation.is_for_the_eye(output, "rig.yaml"):
             warn(*write_result(found, output, lean=lean))
-        write_plot(plot, draw_rig, found)
+        plot_result(plots, found)
         write_page(html, found, *inputs)
         suggest(output, "neurocal evaluate {}", "neurocal triangulate {} POINTS.csv -o XYZ.csv")
 
@@ -194,7 +185,7 @@ def rig(
     "LEFT.yaml RIGHT.yaml",
     "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@panel_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
+@plot_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @options.lean
 @options.summary
@@ -262,8 +253,6 @@ def stereo(
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
-    preparation.compute_in_one_thread()
-    options.check_alpha(alpha)
     ros_files = ros or ()
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
@@ -273,7 +262,7 @@ def stereo(
         known += ["type"] if estimation.type == "2" else []
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
-    preparation.check((*inputs, board), (output, html, *ros_files), plots=files_of(plots), as_json=as_json)
+    preparation.check((*inputs, board), (output, html, *ros_files), plots=plots, as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
     from neurocal_cli.commands.show.rig_report import stereo_json, stereo_report, views_alone
     from neurocal_cli.files.result_files import write_result
@@ -294,10 +283,7 @@ def stereo(
 
             for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
                 write_whole(name, text)
-        if plots:
-            from neurocal_cli.commands.show.plot_pages import draw_stereo
-
-            write_plots(plots, draw_stereo, rig)
+        plot_result(plots, rig)
         write_page(html, rig, *inputs)
         suggest(output, "neurocal evaluate {}", "neurocal rectify {} LEFT... RIGHT... -o DIR")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.preparation import plot_option, write_plot
+from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.streams import ProgressBar, answer, note
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
 from neurocal_cli.files.writing import make_folder, write_whole
@@ -132,7 +132,7 @@ def simulate(
     jobs: int | None,
     save: str | None,
     images: bool,
-    plot: str | None,
+    plots: Plots,
     as_json: bool,
 ) -> None:
     """Calibrate simulated cameras, and compare the methods' errors.
@@ -177,10 +177,9 @@ def simulate(
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
     if save is not None:
         preparation.check_folder("--save", save)
-    preparation.check((camera, board), plots=(plot,))
-    preparation.compute_in_one_thread()
+    preparation.check((camera, board), plots=plots)
     if rig is not None:
-        if rates or (camera, board, plot) != (None,) * 3 or images:
+        if rates or (camera, board) != (None,) * 2 or plots or images:
             raise UsageError(
                 "--rig makes its own cameras and board; leave out --camera, --board, --images, --plot, "
                 "--rates"
@@ -193,7 +192,7 @@ def simulate(
 
     jobs = jobs or usable_cores()
     if rates:
-        _rates(data_sets, seed, jobs, plot, as_json)
+        _rates(data_sets, seed, jobs, plots, as_json)
         return
     scene, paper = _scene(camera, board, views, seed)
     levels = sorted(set(sigma))
@@ -215,7 +214,7 @@ def simulate(
         lambda: simulation_json(scene, seed, study, starts),
         lambda: text_of(*simulation_tables(study, starts, paper)),
     )
-    write_plot(plot, draw_simulation, study, starts, scene.unit)
+    write_plots(plots, draw_simulation, study, starts, scene.unit)
 
 
 def _scene(
@@ -264,14 +263,14 @@ def _starts(
         return None
 
 
-def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
+def _rates(data_sets: int, seed: int, jobs: int, plots: Plots, as_json: bool) -> None:
     from neurocal_cli.commands.show.methods_report import draw_rates, rates_json, rates_tables, text_of
     from neurocal_cli.simulation.starts import study_rates
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
     answer(as_json, lambda: rates_json(study), lambda: text_of(*rates_tables(study)))
-    write_plot(plot, draw_rates, study)
+    write_plots(plots, draw_rates, study)
 
 
 def _rig(

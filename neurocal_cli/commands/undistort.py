@@ -161,7 +161,6 @@ def undistort(
 
 def _check_view(alpha: float | None, shape: str, fov: float | None, size: tuple[int, int] | None) -> None:
     """Refuse options of the result that are out of range or contradict each other."""
-    options.check_alpha(alpha)
     if alpha is not None and (shape != "plane" or fov is not None or size is not None):
         raise UsageError(
             "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
