@@ -179,6 +179,11 @@ class Pose:
         return rotation_to_euler(self.R)
 
     @property
+    def values(self) -> dict[str, float]:
+        """The angles [rad] and the translation, by `POSE_NAMES`."""
+        return dict(zip(POSE_NAMES, [*self.euler.tolist(), *self.t.tolist()], strict=True))
+
+    @property
     def D(self) -> Array:
         """(3, 4) array [R | t], the paper's D without its last row."""
         return np.column_stack([self.R, self.t])

@@ -100,8 +100,7 @@ def _stereo_lines(rig: StereoRig, rectified: Rectification | None) -> Iterator[s
 
 
 def _estimates(rig: StereoRig) -> list[tuple[str, tuple[float, float]]]:
-    values = zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True)
-    return [(name, (value, rig.std[name])) for name, value in values]
+    return [(name, (value, rig.std[name])) for name, value in rig.pose.values.items()]
 
 
 def read_stereo_rig(path: str | Path) -> StereoRig:

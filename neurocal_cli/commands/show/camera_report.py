@@ -12,7 +12,6 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration, Verdict, ViewResult, fixed_intrinsics
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
@@ -89,10 +88,9 @@ def parameter_rows(calibration: Calibration) -> Table:
         rows.append(_displacement_row(calibration))
     if len(calibration.views) == 1:
         ((label, view),) = calibration.views.items()
-        values = [*view.pose.euler, *view.pose.t]
-        for name, value in zip(POSE_NAMES, values, strict=True):
+        for name, value in view.pose.values.items():
             unit = "rad" if name.startswith("R") else printable(calibration.unit)
-            rows.append(_parameter_row(name, unit, float(value), view.std[name], view.fixed))
+            rows.append(_parameter_row(name, unit, value, view.std[name], view.fixed))
         if not view.fixed and len(calibration.points):
             for name, value, std in _position(calibration, label):
                 own = labelled(f"camera's {name}", printable(calibration.unit))

@@ -14,11 +14,11 @@ from neurocal_cli.commands.show.text import (
     Table,
     align,
     align_views,
+    estimates,
     four_digits,
     joined,
     labelled,
     outcome_json,
-    parameters,
     printable,
     rounded,
     verdict_json,
@@ -59,18 +59,9 @@ def camera_rows(rig: Rig) -> tuple[Table, Table]:
     for name, camera in rig.cameras.items():
         counts = str(len(camera.views)), str(len(camera.points))
         seen.append([printable(name), *counts, camera.distortion_model, four_digits(camera.rmse_px)])
-        values = parameters(camera)
-        found.append(
-            [
-                printable(name),
-                *(
-                    f"{values[key]:.7g} fixed"
-                    if key in camera.fixed
-                    else with_std(values[key], camera.std.get(key, math.nan))
-                    for key in _SHOWN
-                ),
-            ]
-        )
+        cells = estimates(camera)
+        values = [(" " if key in camera.fixed else " +- ").join(cells[key]) for key in _SHOWN]
+        found.append([printable(name), *values])
     return seen, found
 
 
@@ -80,9 +71,8 @@ def pose_rows(rig: Rig) -> tuple[Table, Table]:
     turns = [[heading, *(f"{name} [rad]" for name in POSE_NAMES[:3])]]
     shifts = [["", *(f"{name} [{length}]" for name in POSE_NAMES[3:]), f"distance [{length}]"]]
     for name, pose in list(rig.poses.items())[1:]:
-        values = dict(zip(POSE_NAMES, [*pose.euler.tolist(), *pose.t.tolist()], strict=True))
         std = rig.std[name]
-        cells = [with_std(values[key], std[key]) for key in POSE_NAMES]
+        cells = [with_std(value, std[key]) for key, value in pose.values.items()]
         distance = math.sqrt(float(pose.t @ pose.t))
         turns.append([printable(name), *cells[:3]])
         shifts.append([printable(name), *cells[3:], with_std(distance, std["baseline"])])
@@ -100,19 +90,25 @@ def _edge_lines(rig: Rig) -> list[str]:
 
 
 def _fit_lines(rig: Rig) -> list[str]:
-    lines = [
-        f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} "
-        "px, after "
-        f"{plural(rig.iterations, 'iteration')}"
-    ]
+    lines = [_adjusted(rig)]
     if rig.delays:
-        unit = "s" if rig.timed else "of the time between frames"
         told = ", ".join(f"{printable(name)} {with_std(*delay)}" for name, delay in rig.delays.items())
-        lines.append(f"images later than those of {printable(rig.first)}: {told} {unit}")
+        lines.append(f"images later than those of {printable(rig.first)}: {told} {_time_unit(rig)}")
     if rig.left_out:
         lines.append(f"{plural(len(rig.left_out), 'view')} left out of the rig")
     lines += target_lines(rig.cameras[rig.first].target, rig.unit)
     return [*lines, rig.stop_reason]
+
+
+def _adjusted(rig: Rig | StereoRig) -> str:
+    return (
+        f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} px, after "
+        f"{plural(rig.iterations, 'iteration')}"
+    )
+
+
+def _time_unit(rig: Rig | StereoRig) -> str:
+    return "s" if rig.timed else "of the time between frames"
 
 
 def rig_json(rig: Rig) -> dict[str, Any]:
@@ -200,18 +196,10 @@ def side_rows(rig: StereoRig) -> Table:
     """Both cameras' parameters side by side."""
     rows = [["parameter", "left", "std", "right", "std"]]
     rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
-    cells = [
-        {
-            name: (f"{value:.7g}", "fixed")
-            if name in camera.fixed
-            else rounded(value, camera.std.get(name, math.nan))
-            for name, value in parameters(camera).items()
-        }
-        for camera in (rig.left, rig.right)
-    ]
+    cells = [estimates(camera) for camera in (rig.left, rig.right)]
     for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
-        estimates = [cell for own in cells for cell in own.get(name, ("", ""))]
-        rows.append([labelled(name, UNITS.get(name, "")), *estimates])
+        both = [cell for own in cells for cell in own.get(name, ("", ""))]
+        rows.append([labelled(name, UNITS.get(name, "")), *both])
     return rows
 
 
@@ -219,14 +207,10 @@ def rig_rows(rig: StereoRig) -> Table:
     """Rows of the pose of the right camera and the baseline, with their standard deviations."""
     rows = [["X_right = R X_left + t", "value", "std"]]
     length = printable(rig.unit)
-    for name, value in _pose_values(rig).items():
+    for name, value in rig.pose.values.items():
         unit = "rad" if name.startswith("R") else length
         rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
     return [*rows, [f"baseline [{length}]", *rounded(rig.baseline, rig.std["baseline"])]]
-
-
-def _pose_values(rig: StereoRig) -> dict[str, float]:
-    return dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
 
 
 def _pair_fit_lines(rig: StereoRig) -> list[str]:
@@ -239,13 +223,9 @@ def _pair_fit_lines(rig: StereoRig) -> list[str]:
                 f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
                 f"at least {record.agreed} agreed in each view; rms {four_digits(camera.rmse_px)} px"
             )
-    lines.append(
-        f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} px, after "
-        f"{plural(rig.iterations, 'iteration')}"
-    )
+    lines.append(_adjusted(rig))
     if rig.delay is not None:
-        unit = "s" if rig.timed else "of the time between frames"
-        lines.append(f"right images later than the left ones: {with_std(*rig.delay)} {unit}")
+        lines.append(f"right images later than the left ones: {with_std(*rig.delay)} {_time_unit(rig)}")
     lines += target_lines(rig.left.target or rig.right.target, rig.unit)
     measures = {} if rig.verdict is None else rig.verdict.measures
     growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
@@ -267,7 +247,7 @@ def stereo_json(rig: StereoRig) -> dict[str, Any]:
         "t": rig.t,
         "baseline": rig.baseline,
         "parameters": {
-            name: {"value": value, "std": rig.std[name]} for name, value in _pose_values(rig).items()
+            name: {"value": value, "std": rig.std[name]} for name, value in rig.pose.values.items()
         },
         "baseline_std": rig.std["baseline"],
         "rmse_px": rig.rmse_px,

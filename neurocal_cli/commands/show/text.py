@@ -160,6 +160,16 @@ def parameters(calibration: Calibration) -> dict[str, float]:
     return dict(zip(names, values, strict=True))
 
 
+def estimates(calibration: Calibration, given: str = "fixed") -> dict[str, tuple[str, str]]:
+    """The same as text, with the standard deviations, or with this word where the value was given."""
+    return {
+        name: (f"{value:.7g}", given)
+        if name in calibration.fixed
+        else rounded(value, calibration.std.get(name, math.nan))
+        for name, value in parameters(calibration).items()
+    }
+
+
 def parameters_json(calibration: Calibration) -> dict[str, dict[str, Any]]:
     """The same for JSON, with the standard deviations."""
     return {

@@ -21,10 +21,10 @@ from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
     align,
+    estimates,
     joined,
     labelled,
     number,
-    parameters,
     rounded,
     verdict_json,
     verdict_lines,
@@ -124,9 +124,7 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
 def camera_report(calibration: Calibration) -> str:
     """Table of the parameters of the camera at a setting."""
     rows = [["parameter", "value", "std"]]
-    for name, value in parameters(calibration).items():
-        given = name in calibration.fixed
-        cells = (f"{value:.7g}", "given") if given else rounded(value, calibration.std[name])
+    for name, cells in estimates(calibration, "given").items():
         rows.append([labelled(name, UNITS.get(name, "")), *cells])
     return joined([f"{calibration.camera_name}: {calibration.stop_reason}"], align(rows))
 
