@@ -10,7 +10,7 @@ import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
-from neurocal_cli.commands.streams import print_summary, say, suggest, warn
+from neurocal_cli.commands.streams import suggest, summarise, warn
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.files.writing import write_whole
 
@@ -151,8 +151,9 @@ def target(camera: str, file: str | None, plots: Plots, as_json: bool, output: s
     preparation.check((camera, file), (output,), plots=plots, as_json=as_json)
     from neurocal_cli.commands.show.camera_panels import draw_target
     from neurocal_cli.commands.show.camera_report import target_json, target_lines
-    from neurocal_cli.files.board_yaml import read_board, write_board
+    from neurocal_cli.files.board_yaml import parse_board, write_board
     from neurocal_cli.files.calibration_yaml import read_calibration
+    from neurocal_cli.observations.estimated_board import with_found_points
     from neurocal_cli.observations.target import board_of
 
     calibration = read_calibration(camera)
@@ -163,28 +164,15 @@ def target(camera: str, file: str | None, plots: Plots, as_json: bool, output: s
         )
     write_plots(plots, draw_target, calibration.target, calibration.unit)
     known = calibration.target, calibration.unit, calibration.points.distances
-    described = None
-    if file is not None:
-        from neurocal_cli.files.board_kinds import short_board
-
-        described = short_board(file, calibration.unit) or read_board(file)
-    elif calibration.points.board:
-        from neurocal_cli.files.board_yaml import parse_board
-
+    described = None if file is None else boards.named_board(file, calibration.unit)
+    if described is None and calibration.points.board:
         described = parse_board(calibration.points.board, f"{camera}: observations.board")
-    if described is None:
-        board = board_of(*known)
-    else:
-        from neurocal_cli.observations.estimated_board import with_found_points
-
-        board = with_found_points(described, *known)
+    board = board_of(*known) if described is None else with_found_points(described, *known)
     if not preparation.is_for_the_eye(output, "board.yaml"):
         write_board(board, output)
     suggest(output, "neurocal detect IMAGE... --board {} -o points.csv")
-    if as_json:
-        print_summary(target_json(calibration.target, calibration.unit) or {})
-    else:
-        say("\n".join(target_lines(calibration.target, calibration.unit)))
+    found = calibration.target, calibration.unit
+    summarise(as_json, target_json(*found) or {}, *target_lines(*found))
 
 
 def _draw(path: str, sheet: Sheet, dpi: float) -> None:
@@ -210,17 +198,13 @@ def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> N
         )
     if plain and any(min(plane.cols, plane.rows) < 3 for plane in target.planes):
         warn("neurocal detect needs at least 3 x 3 inner vertices")
-    if as_json:
-        keys = ("name", "cols", "rows", "square")
-        planes = [
-            {"kind": kind_of(plane), **{key: getattr(plane, key) for key in keys}} for plane in target.planes
-        ]
-        paper = [sheet.width, sheet.height]
-        print_summary({"unit": target.unit, "planes": planes, "paper_mm": paper, "board_file": beside})
-        return
-    for plane in target.planes:
-        name = f"{plane.name}: " if plane.name else ""
-        say(f"{name}{described(plane, target.unit)}")
-    say(f"paper {sheet.width:g} x {sheet.height:g} mm; print at 100 % and measure the rulers")
-    if beside is not None:
-        say(f"board file: {beside}")
+    keys, paper = ("name", "cols", "rows", "square"), [sheet.width, sheet.height]
+    planes = [
+        {"kind": kind_of(plane), **{key: getattr(plane, key) for key in keys}} for plane in target.planes
+    ]
+    lines = [
+        f"{f'{plane.name}: ' if plane.name else ''}{described(plane, target.unit)}" for plane in target.planes
+    ]
+    lines.append(f"paper {sheet.width:g} x {sheet.height:g} mm; print at 100 % and measure the rulers")
+    summary = {"unit": target.unit, "planes": planes, "paper_mm": paper, "board_file": beside}
+    summarise(as_json, summary, *lines, *([] if beside is None else [f"board file: {beside}"]))

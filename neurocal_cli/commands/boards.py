@@ -49,50 +49,31 @@ class BoardOptions:
 
     def read(self) -> Board | None:
         """The board; None if no option describes one, a UsageError if they contradict each other."""
-        from neurocal_cli.observations.board import Board
-
         self.check_unit()
-        cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
+        size = {"--cols": self.cols, "--rows": self.rows, "--square": self.square}
+        missing = [name for name, value in size.items() if value is None]
         if self.file is not None:
-            from neurocal_cli.files.board_kinds import short_board
-
-            if (cols, rows, square) == (None,) * 3:
-                short = short_board(self.file, "mm" if unit is None else unit)
-                if short is not None:
-                    return short
-            if (cols, rows, square, unit) != (None,) * 4:
+            if len(missing) < len(size) or (self.unit is not None and self.is_file):
                 raise UsageError(
                     "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
                 )
-            stem, ending = os.path.splitext(self.file)
-            if ending.lower() in _PICTURES:
-                raise UsageError(
-                    f"--board {self.file} is a picture; give the board file, such as {stem}.yaml"
-                )
-            if re.fullmatch(r"\d+x\d+(:[\d.]+)?", self.file) and not os.path.exists(self.file):
-                size, _, side = self.file.partition(":")
-                raise UsageError(f"--board {self.file}: give --board chessboard:{size}:{side or 'SQUARE'}")
-            from neurocal_cli.files.board_yaml import read_board
-
-            return read_board(self.file)
-        if (cols, rows, square, unit) == (None,) * 4:
+            return named_board(self.file, self.unit or "mm")
+        if len(missing) == len(size) and self.unit is None:
             return None
-        if cols is None or rows is None or square is None:
-            given = {"--cols": cols, "--rows": rows, "--square": square}
-            missing = " and ".join(name for name, value in given.items() if value is None)
-            raise UsageError(f"{missing} missing; give --cols, --rows and --square, or --board BOARD.yaml")
-        return Board.single(cols, rows, square, "mm" if unit is None else unit)
+        if missing:
+            raise UsageError(
+                f"{' and '.join(missing)} missing; give --cols, --rows and --square, or --board BOARD.yaml"
+            )
+        return self.read_or_unknown()
 
     def read_or_unknown(self) -> Board | None:
         """The board, for a command that finds its size itself: None without a size; the square may lack."""
-        if self.file is not None:
-            return self.read()
-        counts, (square, unit) = self.counts, self.side
-        if not counts:
-            return None
         from neurocal_cli.observations.board import Board
 
-        return Board.single(*counts, square, unit)
+        if self.file is not None:
+            return self.read()
+        counts, side = self.counts, self.side
+        return Board.single(*counts, *side) if counts else None
 
     @property
     def counts(self) -> tuple[int, int] | tuple[()]:
@@ -109,7 +90,7 @@ class BoardOptions:
         """Side of a square and its unit; if the side is unknown, it is the unit."""
         self.check_unit()
         if self.square is not None:
-            return self.square, "mm" if self.unit is None else self.unit
+            return self.square, self.unit or "mm"
         if self.unit is not None:
             raise UsageError("--unit is the unit of --square, which is missing; give both")
         return 1.0, "squares"
@@ -154,9 +135,20 @@ def board_of_corners(command: F) -> F:
     return options.path("--board", "BOARD.yaml", what)(command)
 
 
-def named_board(name: str | None) -> Board | None:
-    """The board of ``--board``, a file or a short form; None without."""
-    return BoardOptions(name, None, None, None, None).read() if name else None
+def named_board(name: str, unit: str = "mm") -> Board:
+    """The board of ``--board``: a short form with lengths in this unit, or a file."""
+    from neurocal_cli.files.board_kinds import short_board
+    from neurocal_cli.files.board_yaml import read_board
+
+    if (short := short_board(name, unit)) is not None:
+        return short
+    stem, ending = os.path.splitext(name)
+    if ending.lower() in _PICTURES:
+        raise UsageError(f"--board {name} is a picture; give the board file, such as {stem}.yaml")
+    if re.fullmatch(r"\d+x\d+(:[\d.]+)?", name) and not os.path.exists(name):
+        size, _, side = name.partition(":")
+        raise UsageError(f"--board {name}: give --board chessboard:{size}:{side or 'SQUARE'}")
+    return read_board(name)
 
 
 def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:

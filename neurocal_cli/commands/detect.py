@@ -27,9 +27,8 @@ from neurocal_cli.commands.streams import (
     note,
     note_once,
     one_line,
-    print_summary,
-    say,
     suggest,
+    summarise,
     warn,
     where_reasons_are,
 )
@@ -310,13 +309,12 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
         "views": {name: len(detection.ids) for name, detection in found.items()},
         "without_board": {name: one_line(problem) for name, problem in problems.items()},
     }
-    if as_json:
-        print_summary(summary)
-        return
     unread = [outcome.path for outcome in outcomes.values() if outcome.unread]
-    say(
+    summarise(
+        as_json,
+        summary,
         f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
-        f"{summary['n_rejected']} rejected" + (f"; {first_of(unread)} could not be read" if unread else "")
+        f"{summary['n_rejected']} rejected" + (f"; {first_of(unread)} could not be read" if unread else ""),
     )
 
 

@@ -94,17 +94,18 @@ def given_points(*names: str, board: str | None = "") -> Correspondences:
 
     Corners without their places need a board, its file or a short form; "" is that of a command without one.
     """
-    from neurocal_cli.files.points_csv import POINTS, ids_at_two_places, read_points
+    from neurocal_cli.files.points_csv import POINTS, TABLES, ids_at_two_places, read_points
     from neurocal_cli.files.reading import repeatable_stdin
 
     notes: list[str] = []
     with repeatable_stdin() if "-" in names else nullcontext():
         points = None
-        if board or not names[0].lower().endswith((".csv", ".txt", ".tsv")):
+        if board or not names[0].lower().endswith(TABLES):
             from neurocal_cli.files.exchange.corners import BOARD_ADVICE, read_corners
 
             advice = POINTS.instead.removeprefix("; ") if board == "" else BOARD_ADVICE
-            points = read_corners(names, boards.named_board(board), notes, what="points", advice=advice)
+            described = boards.named_board(board) if board else None
+            points = read_corners(names, described, notes, what="points", advice=advice)
         if points is None:
             points = read_points(names, notes=notes)
     note(*notes, *ids_at_two_places(points))
@@ -160,11 +161,11 @@ def calibration_or_camera(
     return camera_of(camera), points
 
 
-def warn_of_poor(rig: StereoRig | Rig, so: str = "") -> None:
-    """Warn of a rig whose verdict is poor, with the first reason and what follows from it."""
-    verdict = rig.verdict
+def warn_of_poor(what: str, result: Calibration | StereoRig | Rig, so: str = "") -> None:
+    """Warn of a result whose verdict is poor, with the first reason and what follows from it."""
+    verdict = result.verdict
     if verdict is not None and verdict.word == "poor":
-        warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
+        warn(f"the {what} is poor: {'; '.join(verdict.reasons[:1])}{so}")
 
 
 def plot_option(what: str, panels: Sequence[str] = ()) -> Callable[[F], F]:

@@ -197,7 +197,7 @@ class _Work:
             points = f"the rig's own {error.n_points} points"
             self._tell(f"{self.along} of {points} differ by {error.rms_px:.3g} px rms")
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": error.rms_px}
-        preparation.warn_of_poor(self.rig)
+        preparation.warn_of_poor("rig", self.rig)
 
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""

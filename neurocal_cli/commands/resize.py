@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note, print_summary, say, suggest, warn, warned
+from neurocal_cli.commands.streams import note, suggest, summarise, warn, warned
 from neurocal_cli.errors import source_of, value_failures
 
 if TYPE_CHECKING:
@@ -75,13 +75,9 @@ def resize(
     origin = None if found.origin is None else resized(found.origin, changes)
     note(*write_result(result_of(replace(found, cameras=cameras, origin=origin)), output))
     warn(*_doubts(changes[0], found.cameras[0]))
-    if as_json:
-        print_summary({"cameras": [_summary(camera) for camera in cameras]})
-    else:
-        for camera in cameras:
-            say(_line(camera))
-        if len(cameras) == 1:
-            suggest(output, "neurocal undistort {} IMAGE... -o DIR")
+    summarise(as_json, {"cameras": [_summary(camera) for camera in cameras]}, *map(_line, cameras))
+    if len(cameras) == 1:
+        suggest(output, "neurocal undistort {} IMAGE... -o DIR")
 
 
 def _doubts(change: Resizing, camera: Camera) -> list[str]:

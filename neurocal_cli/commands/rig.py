@@ -142,7 +142,7 @@ def rig(
     from neurocal_cli.files.result_files import write_result
     from neurocal_cli.files.rig_points import read_rig_points
 
-    points = noted(read_rig_points, named, board=boards.named_board(board))
+    points = noted(read_rig_points, named, board=boards.named_board(board) if board else None)
     for what, given in (("--intrinsics", known), ("--distortion", models)):
         for name, _ in given:
             if name not in points:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options, preparation
+from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.streams import ProgressBar, answer, note
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
@@ -229,9 +229,7 @@ def _scene(
         return scenes.paper_scene(), True
     camera, board = scenes.PAPER_CAMERA, scenes.PAPER_BOARD
     if board_file is not None:
-        from neurocal_cli.files.board_yaml import read_board
-
-        board = read_board(board_file)
+        board = boards.named_board(board_file)
     if camera_file is not None:
         from neurocal_cli.camera.camera import camera_of
         from neurocal_cli.files.calibration_yaml import read_calibration

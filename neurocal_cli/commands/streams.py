@@ -329,6 +329,14 @@ def answer(as_json: bool, in_json: Callable[[], dict[str, Any]], in_words: Calla
         print_text(in_words)
 
 
+def summarise(as_json: bool, tree: dict[str, Any], *lines: str) -> None:
+    """Tell what was written: as JSON on stdout, or in words."""
+    if as_json:
+        print_summary(tree)
+    else:
+        say("\n".join(lines))
+
+
 def suggest(output: str | None, *steps: str) -> None:
     """Suggest what to do next with a file, ``{}``; a terminal shows it when the command has ended."""
     if output not in (None, "-"):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import end_waiting, note, noted, print_summary, say, warn
+from neurocal_cli.commands.streams import end_waiting, note, noted, summarise, warn
 from neurocal_cli.errors import InputError, UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
     from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.calibration.rig.triangulation import Triangulated
+    from neurocal_cli.camera.geometry import Array
     from neurocal_cli.camera.measured import PlanePoints
-    from neurocal_cli.files.measurement_csv import Batch, Matches
-
-T = TypeVar("T")
+    from neurocal_cli.files.measurement_csv import Batch
+    from neurocal_cli.files.table_header import Schema
 
 _USUAL_SIGMA = 0.5  # px; default for a rig without points
 _LARGEST_SIGMA = 1e6  # px; no image is that large
@@ -136,12 +136,12 @@ def triangulate(
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
-    from neurocal_cli.files.measurement_csv import format_space_points, read_matches
+    from neurocal_cli.files.measurement_csv import MATCHES, format_space_points
 
     sigma = _sigma_of(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     tally = _Tally(rig, limit)
-    matches = _begun(read_matches, inputs[-1])
+    matches = _begun(inputs[-1], MATCHES)
     end_waiting()
     write_chunks(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
@@ -157,10 +157,12 @@ def _sigma_of(rig: Rig | StereoRig) -> float:
     return _USUAL_SIGMA
 
 
-def _begun(read: Callable[[str, list[str]], Iterator[T]], file: str) -> Iterator[T]:
+def _begun(file: str, schema: Schema) -> Iterator[Batch]:
     """Batches of a file, the first of which is read now, so that errors there leave the output untouched."""
+    from neurocal_cli.files.measurement_csv import read_pixels
+
     notes: list[str] = []
-    batches = read(file, notes)
+    batches = read_pixels(file, schema, notes)
     batches = chain([next(batches)], batches)
     note(*notes)
     return batches
@@ -172,19 +174,17 @@ def _on_plane(camera: str, pixels: str, view: str, sigma: float | None, as_json:
 
     from neurocal_cli.calibration.verdict.findings import two_digits
     from neurocal_cli.files.calibration_yaml import read_calibration
-    from neurocal_cli.files.measurement_csv import format_plane_points, read_pixels
+    from neurocal_cli.files.measurement_csv import PIXELS, format_plane_points
 
     calibration = read_calibration(camera)
     calibration.pose_of(view)
     if sigma is None and not np.isfinite(calibration.sigma):
         raise InputError(f"{camera} does not say how accurate its pixels are; give --sigma")
     sigma = calibration.sigma if sigma is None else sigma
-    verdict = calibration.verdict
-    if verdict is not None and verdict.word == "poor":
-        warn(f"the calibration is poor: {'; '.join(verdict.reasons[:1])}; points may be far off")
+    preparation.warn_of_poor("calibration", calibration, "; points may be far off")
     if calibration.points.undistorted:
         note("the camera was calibrated from undistorted points; undistort its pixels alike")
-    batches = _begun(read_pixels, pixels)
+    batches = _begun(pixels, PIXELS)
     missed, variances = 0, np.zeros((0, 2))
 
     def located(batches: Iterator[Batch]) -> Iterator[tuple[PlanePoints, NDArray[Any] | None]]:
@@ -201,17 +201,15 @@ def _on_plane(camera: str, pixels: str, view: str, sigma: float | None, as_json:
     end_waiting()
     write_chunks(output, format_plane_points(located(batches), view=view, unit=calibration.unit, sigma=sigma))
     of_camera, of_pixel = np.sqrt(np.median(variances, axis=0)).tolist() if len(variances) else [np.nan] * 2
-    if as_json:
-        parts = {"calibration": of_camera, "pixels": of_pixel}
-        print_summary({"n_points": len(variances) + missed, "n_behind": missed, "std": parts})
-        return
     told = [plural(len(variances) + missed, "point")]
     told += [f"{missed} of them not on the plane in front of the camera"] if missed else []
     if np.isfinite(of_pixel):
         shares = [f"{two_digits(of_pixel)} {calibration.unit} by the pixels"]
         shares += [f"{two_digits(of_camera)} by the calibration"] if np.isfinite(of_camera) else []
         told.append(f"std {' and '.join(shares)}")
-    say(", ".join(told))
+    std = {"calibration": of_camera, "pixels": of_pixel}
+    counts = {"n_points": len(variances) + missed, "n_behind": missed, "std": std}
+    summarise(as_json, counts, ", ".join(told))
 
 
 def _of_many(rig: str, matches: str) -> bool:
@@ -219,7 +217,7 @@ def _of_many(rig: str, matches: str) -> bool:
     from neurocal_cli.files.camera_tree import own_kind, read_tree
     from neurocal_cli.files.measurement_csv import has_sightings
 
-    return (matches != "-" and has_sightings(matches)) or (rig != "-" and own_kind(read_tree(rig)) == "rig")
+    return has_sightings(matches) or (rig != "-" and own_kind(read_tree(rig)) == "rig")
 
 
 def _triangulate_many(
@@ -232,7 +230,7 @@ def _triangulate_many(
     from neurocal_cli.files.rig_yaml import read_rig
 
     rig = read_rig(file)
-    preparation.warn_of_poor(rig, "; points in space may be far off")
+    preparation.warn_of_poor("rig", rig, "; points in space may be far off")
     seen = noted(read_sightings, matches)
     sigma = _sigma_of(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if limit is None else limit
@@ -243,10 +241,6 @@ def _triangulate_many(
     write_chunks(output, text)
     off = int((~found.behind & ~(found.error <= limit)).sum())
     behind, without = int(found.behind.sum()), int((found.contradicts >= 0).sum())
-    if as_json:
-        counts = {"n_points": len(found.points), "n_off": off, "n_behind": behind, "n_without": without}
-        print_summary({**counts, "error_limit_px": limit})
-        return
     parts = [plural(len(found.points), "point")]
     parts += [f"{off} with an error above {limit:.3g} px"] if off else []
     parts += [f"{behind} behind a camera, at infinity or seen by one camera only"] if behind else []
@@ -257,7 +251,8 @@ def _triangulate_many(
             f"{without} of them measured without a camera that contradicts the others, mostly "
             f"{names[worst]} ({count})"
         )
-    say(", ".join(parts))
+    counts = {"n_points": len(found.points), "n_off": off, "n_behind": behind, "n_without": without}
+    summarise(as_json, {**counts, "error_limit_px": limit}, ", ".join(parts))
 
 
 def _rig(names: tuple[str, ...]) -> StereoRig:
@@ -266,7 +261,7 @@ def _rig(names: tuple[str, ...]) -> StereoRig:
         from neurocal_cli.files.rig_yaml import read_stereo_rig
 
         rig = read_stereo_rig(names[0])
-        preparation.warn_of_poor(rig, "; points in space may be far off")
+        preparation.warn_of_poor("rig", rig, "; points in space may be far off")
         return rig
     from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
     from neurocal_cli.files.calibration_yaml import read_calibration
@@ -277,7 +272,7 @@ def _rig(names: tuple[str, ...]) -> StereoRig:
     note(f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}")
     warn(*rig.warnings)
     if not rig.warnings:
-        preparation.warn_of_poor(rig, "; points in space may be far off")
+        preparation.warn_of_poor("rig", rig, "; points in space may be far off")
     return rig
 
 
@@ -287,24 +282,25 @@ class _Tally:
     def __init__(self, rig: StereoRig, limit: float) -> None:
         self.rig, self.limit = rig, limit
         self.points = self.behind = self.off = self.outside = 0
-        self.first: Matches | None = None  # the first batch, a sample for the cause of what is wrong
+        self.first: Array | None = None  # the first batch, a sample for the cause of what is wrong
 
-    def triangulated(self, batches: Iterable[Matches]) -> Iterator[tuple[Triangulated, Any]]:
+    def triangulated(self, batches: Iterable[Batch]) -> Iterator[tuple[Triangulated, Any]]:
         """The points of each batch of matches, and their names."""
         from neurocal_cli.calibration.rig.triangulation import triangulate as solve
 
         rig = self.rig
-        for batch in batches:
-            self.first = self.first or batch
-            found = solve(rig.left, rig.right, rig.pose, batch.left, batch.right)
-            self.points += len(batch)
+        for pixels, labels in batches:
+            self.first = pixels if self.first is None else self.first
+            left, right = pixels[:, :2], pixels[:, 2:]
+            found = solve(rig.left, rig.right, rig.pose, left, right)
+            self.points += len(pixels)
             self.behind += int(found.behind.sum())
             self.off += int((found.off(self.limit) & ~found.behind).sum())
-            for camera, pixels in ((rig.left, batch.left), (rig.right, batch.right)):
+            for camera, own in ((rig.left, left), (rig.right, right)):
                 if camera.image_size is not None:
-                    inside = (pixels > -1).all(axis=1) & (pixels < camera.image_size).all(axis=1)
-                    self.outside += len(pixels) - int(inside.sum())
-            yield found, batch.point
+                    inside = (own > -1).all(axis=1) & (own < camera.image_size).all(axis=1)
+                    self.outside += len(own) - int(inside.sum())
+            yield found, labels
 
     def tell(self, as_json: bool) -> None:
         """Report the outcome on stderr, or as JSON on stdout."""
@@ -315,11 +311,9 @@ class _Tally:
         if self.behind:
             are = "is" if self.behind == 1 else "are"
             parts.append(f"{self.behind} {are} behind a camera or at infinity")
-        if as_json:
-            counts = {"n_points": self.points, "n_off": self.off, "n_behind": self.behind}
-            print_summary({**counts, "n_outside": self.outside, "epipolar_limit_px": self.limit})
-        else:
-            say(", ".join(parts))
+        counts = {"n_points": self.points, "n_off": self.off, "n_behind": self.behind}
+        counts["n_outside"] = self.outside
+        summarise(as_json, {**counts, "epipolar_limit_px": self.limit}, ", ".join(parts))
         if self.outside:
             warn(
                 f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras "
@@ -330,7 +324,7 @@ class _Tally:
             from neurocal_cli.calibration.rig.triangulation import fault_of_matches
 
             assert self.first is not None
-            left, right = self.first.left[:_SAMPLE], self.first.right[:_SAMPLE]
+            left, right = self.first[:_SAMPLE, :2], self.first[:_SAMPLE, 2:]
             fault = fault_of_matches(self.rig, left, right, self.limit) or (
                 "check that uL,vL are pixels of the left camera, that the pixels are neither undistorted nor "
                 "rectified, and the order of the matches"

@@ -28,7 +28,7 @@ _FLAGS = np.array(["ok", "off", "behind"])
 _HEADER = 4096  # bytes in which the header is
 _LARGEST = 1e100  # squares of pixels beyond this overflow
 
-Batch = tuple[Array, NDArray[Any] | None]  # pixels (N, 2) and the names of their points
+Batch = tuple[Array, NDArray[Any] | None]  # pixels (N, 2), or (N, 4) of matches, and names of their points
 
 
 def _pixels(table: Table, names: tuple[str, ...]) -> Array:
@@ -44,30 +44,12 @@ def _pixels(table: Table, names: tuple[str, ...]) -> Array:
     return pixels
 
 
-def read_pixels(path: str | Path, notes: list[str] | None = None, schema: Schema = PIXELS) -> Iterator[Batch]:
-    """Read pixels in batches of some ten thousand; remarks of the first are appended to `notes`."""
+def read_pixels(path: str | Path, schema: Schema, notes: list[str]) -> Iterator[Batch]:
+    """Read pixels or matches in batches of some ten thousand; remarks about columns are added to `notes`."""
     for k, table in enumerate(stream_table(path, schema)):
-        if k == 0 and notes is not None:
+        if k == 0:
             table.note_unknown(notes)
         yield _pixels(table, schema.required), table.labels.get("point")
-
-
-@frozen_dataclass(eq=False)
-class Matches:
-    """Some rows of a file: pixels (N, 2) in the left and the right image, and (N,) names of the points."""
-
-    left: Array
-    right: Array
-    point: NDArray[Any] | None
-
-    def __len__(self) -> int:
-        return len(self.left)
-
-
-def read_matches(path: str | Path, notes: list[str] | None = None) -> Iterator[Matches]:
-    """Read matches in batches; see `read_pixels`."""
-    for pixels, labels in read_pixels(path, notes, MATCHES):
-        yield Matches(pixels[:, :2], pixels[:, 2:], labels)
 
 
 @frozen_dataclass(eq=False)

@@ -23,6 +23,7 @@ from neurocal_cli.observations.labels import first_moved
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.separate_boards import by_board, parts_of
 
+TABLES = (".csv", ".txt", ".tsv")  # endings of files
 PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
 OPTIONAL = {

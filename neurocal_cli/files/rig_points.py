@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.corners import BOARD_ADVICE, TABLES, read_corners
-from neurocal_cli.files.points_csv import POINTS, correspondences
+from neurocal_cli.files.exchange.corners import BOARD_ADVICE, read_corners
+from neurocal_cli.files.points_csv import POINTS, TABLES, correspondences
 from neurocal_cli.files.table import Table, read_table
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.points import Correspondences

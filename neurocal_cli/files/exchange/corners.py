@@ -60,7 +60,6 @@ KEYS = {
     "name of a view": "name image image_name file filename snapshot_name",
 }
 _PIXELS = {plain(name) for name in KEYS["pixels"].split()}
-TABLES = (".csv", ".txt", ".tsv")  # endings of tables of points
 BOARD_ADVICE = "give --board chessboard:COLSxROWS:SQUARE"
 _HEAD = 1_000_000  # characters that show of what kind a file is
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
