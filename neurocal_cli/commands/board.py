@@ -123,8 +123,7 @@ def board(
     "--board",
     "BOARD.yaml",
     "The board that was detected, in a file or in short as for detect, if the points do not tell it, as "
-    "those "
-    "of other programs.",
+    "those of other programs.",
     to="file",
 )
 @plot_option("the heights of the board's points and their shifts")

@@ -13,7 +13,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
-from neurocal_cli.commands.streams import answer, first_of, note, suggest, warn
+from neurocal_cli.commands.streams import answer, first_of, note, noted, suggest, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -162,14 +162,7 @@ def camera(
     from neurocal_cli.calibration.drift import drift_since
     from neurocal_cli.calibration.evaluation import evaluate_camera, judged_by_points
     from neurocal_cli.calibration.verdict.assessment import assess
-    from neurocal_cli.commands.show.camera_report import (
-        evaluation_json,
-        evaluation_tables,
-        plane_json,
-        plane_tables,
-        position_tables,
-        positions_json,
-    )
+    from neurocal_cli.commands.show import camera_report as show
     from neurocal_cli.commands.show.drift_report import drift_json, since_line
     from neurocal_cli.commands.show.text import tabulated, verdict_lines
 
@@ -183,14 +176,13 @@ def camera(
     on_plane = _errors_at(at, own)
     places = {name: own.position(name) for name in own.views} if own is not None and positions else {}
     evaluation = evaluate_camera(judged, seen)
-    verdict, drift = None, None
-    anew = isinstance(judged, Calibration) and given is not None and evaluation.fit is not None
-    if isinstance(judged, Calibration):
-        verdict = assess(judged)
-        if evaluation.fit is not None and anew:
-            drift = drift_since(judged, evaluation.fit.points)
-        if verdict is not None and given is not None:
-            verdict = judged_by_points(verdict, judged, evaluation.given_points, drift)
+    verdict = None if own is None else assess(own)
+    drift, since = None, list[str]()
+    if own is not None and given is not None and evaluation.fit is not None:
+        drift = drift_since(own, evaluation.fit.points)
+        since = [since_line(drift)]
+    if own is not None and given is not None and verdict is not None:
+        verdict = judged_by_points(verdict, own, evaluation.given_points, drift)
     renamed = evaluation.renamed
     for names, why in (
         ([name for name in evaluation.fitted_views if name not in renamed], "not in the calibration"),
@@ -201,15 +193,14 @@ def camera(
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
-    since = {} if drift is None else {"drift": drift_json(drift)}
-    where = {"positions": positions_json(places)} if positions else {}
+    changed = {} if drift is None else {"drift": drift_json(drift)}
+    where = {"positions": show.positions_json(places)} if positions else {}
     unit = "" if own is None else own.unit
-    tables = *evaluation_tables(evaluation), *plane_tables(on_plane, unit), *position_tables(places, unit)
-    lines = [*([since_line(drift)] if anew else []), *verdict_lines(verdict)]
+    tables = *show.plane_tables(on_plane, unit), *show.position_tables(places, unit)
     answer(
         as_json,
-        lambda: evaluation_json(evaluation, verdict) | since | plane_json(on_plane) | where,
-        lambda: tabulated(tables, lines),
+        lambda: show.evaluation_json(evaluation, verdict) | changed | show.plane_json(on_plane) | where,
+        lambda: tabulated((*show.evaluation_tables(evaluation), *tables), [*since, *verdict_lines(verdict)]),
     )
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
@@ -303,25 +294,21 @@ def stereo(
     if at is not None and rig is None:
         raise UsageError("--at needs a rig; give one that neurocal stereo wrote")
     space = _errors_at(at, rig)
+    from neurocal_cli.commands.show import rig_report as show
     from neurocal_cli.commands.show.camera_report import plane_json, plane_tables
-    from neurocal_cli.commands.show.rig_report import (
-        stereo_evaluation_json,
-        stereo_evaluation_tables,
-        views_alone,
-    )
     from neurocal_cli.commands.show.text import tabulated, verdict_lines
 
-    note(*views_alone(evaluation.alone))
+    note(*show.views_alone(evaluation.alone))
     if evaluation.fitted:
         note(
             f"{first_of(evaluation.fitted)}: the calibrations have no such images; the poses are fitted with "
             "the cameras fixed"
         )
     warn(*evaluation.warnings)
-    tables = *stereo_evaluation_tables(evaluation), *plane_tables(space, evaluation.unit)
+    tables = *show.stereo_evaluation_tables(evaluation), *plane_tables(space, evaluation.unit)
     answer(
         as_json,
-        lambda: stereo_evaluation_json(evaluation) | plane_json(space),
+        lambda: show.stereo_evaluation_json(evaluation) | plane_json(space),
         lambda: tabulated(tables, verdict_lines(evaluation.verdict)),
     )
     if plots:
@@ -377,9 +364,8 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     from neurocal_cli.files.rig_points import read_rig_points
     from neurocal_cli.files.rig_yaml import read_rig
 
-    found, notes = read_rig(file), list[str]()
-    given = read_rig_points(named, notes) if named else None
-    note(*notes)
+    found = read_rig(file)
+    given = noted(read_rig_points, named) if named else None
     evaluation, space = evaluate_rig(found, given), _errors_at(at, found)
     if evaluation.n_behind:
         warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from neurocal_cli.commands import options, preparation
@@ -104,17 +106,12 @@ def lens() -> None:
 @options.output("LENS.yaml", "Write the lens to this file.")
 def fit(
     points: tuple[str, ...],
-    distortion: str,
-    training: str,
-    camera: str,
     hidden: tuple[int, int] | None,
-    outliers: str,
     no_skew: bool,
-    target: str,
-    seed: int,
     plots: Plots,
     as_json: bool,
     output: str,
+    **same: Any,  # arguments of `fit_lens` with the same names and values
 ) -> None:
     """Learn how the camera depends on zoom and focus.
 
@@ -152,20 +149,9 @@ def fit(
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
             options.note_unused("on known cameras", *_OF_POINTS)
-            learnt = fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
+            learnt = fit_lens_cameras(data, same["seed"], topologies=topologies, progress=progress)
         else:
-            learnt = fit_lens(
-                data,
-                distortion=distortion,
-                training=training,
-                outliers=outliers,
-                camera=camera,
-                skew=not no_skew,
-                seed=seed,
-                target=target,
-                topologies=topologies,
-                progress=progress,
-            )
+            learnt = fit_lens(data, skew=not no_skew, topologies=topologies, progress=progress, **same)
     with concluding(learnt, as_json, lens_json, lens_report):
         if not preparation.is_for_the_eye(output, "lens.yaml"):
             write_lens(learnt, output)

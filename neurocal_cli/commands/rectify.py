@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn, warned
+from neurocal_cli.commands.streams import each_of, note, noted, print_summary, say, warn, warned
 from neurocal_cli.errors import FormatError, InputError, UsageError, plural
 from neurocal_cli.files.image_files import find_images, is_image, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
@@ -106,10 +106,6 @@ def rectify(
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
     preparation.check_outputs((), (*sides[0], *sides[1]))
-    for side, paths in zip(_SIDES, sides, strict=True):
-        folder = os.path.realpath(os.path.join(output, side))
-        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
-            raise UsageError(f"{folder} is the folder of the inputs; give another output")
     from neurocal_cli.calibration.rig.rectification import rectified_pair
     from neurocal_cli.files.exchange.reading import read_cameras
 
@@ -231,17 +227,15 @@ class _Work:
         from neurocal_cli.calibration.rig.rectification import rectify_points
         from neurocal_cli.files.points_csv import read_points
 
-        notes: list[str] = []
-        points = read_points(path, notes=notes)
+        points = noted(read_points, path)
         if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
             warn(why)
         moved = rectify_points(self.pair, side, points)
         if len(moved) < len(points):
-            notes.append(
+            note(
                 f"{points.source}: {len(points) - len(moved)} of {len(points)} points are left out, "
                 "which are 90 degrees from the rectified camera's axis or more"
             )
-        note(*notes)
         return moved
 
     def rectify_images(self, sides: _Paths) -> None:

@@ -90,8 +90,7 @@ def _is_number(word: str) -> bool:
     "--rig",
     "LAYOUT:N",
     "Simulate a rig of N cameras instead, in a line, a ring, a star or in two groups (facing), which see a "
-    "board of "
-    "6 x 5 corners in --views frames.",
+    "board of 6 x 5 corners in --views frames.",
     without="one camera",
 )
 @options.flag(

@@ -17,6 +17,7 @@ from neurocal_cli.commands.streams import (
     is_terminal,
     note,
     note_once,
+    noted,
     print_summary,
     say,
     warn,
@@ -344,8 +345,7 @@ class _Undistorting:
         from neurocal_cli.files.points_csv import format_points, read_points
         from neurocal_cli.observations.undistorted_points import map_points, shown
 
-        notes: list[str] = []
-        points = read_points(path, notes=notes)
+        points = noted(read_points, path)
         self.size = self.size or points.image_size
         if points.image_size not in (None, self.size):
             raise InputError(
@@ -363,13 +363,11 @@ class _Undistorting:
             raise InputError(f"{points.source}: no plane shows its points; add --to cylinder")
         self.left_out += int((~kept).sum())
         if not kept.all():
-            notes.append(
+            note(
                 f"{points.source}: {(~kept).sum()} of {len(points)} points are left out, which are 90 "
                 "degrees from the axis or more; --to cylinder keeps them"
             )
-        corrected = map_points(points.select(kept), self.camera, new)
-        note(*notes)
-        return format_points(corrected)
+        return format_points(map_points(points.select(kept), self.camera, new))
 
 
 def _size(size: tuple[int, int] | None) -> str:

@@ -37,6 +37,9 @@ from neurocal_cli.files.yaml_text import (
     text,
 )
 
+if TYPE_CHECKING:
+    from neurocal_cli.camera.undistortion import Panorama
+
 # Comments of JSON, outside texts, which are found first; with the commas before a closing bracket.
 _COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/|,(?=\s*[}\]])', re.DOTALL)
 _PER_LINE = 4  # numbers; OpenCV's reader refuses lines of more than some thousand characters
@@ -188,9 +191,6 @@ def _xml_text(text: str) -> str:
 
     return '"' + escape(text, {'"': "&quot;"}) + '"'
 
-
-if TYPE_CHECKING:
-    from neurocal_cli.camera.undistortion import Panorama
 
 _PACKED = "$base64$"
 _FORMULAS = {

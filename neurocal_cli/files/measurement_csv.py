@@ -80,15 +80,14 @@ def read_sightings(path: str | Path, notes: list[str] | None = None) -> Sighting
     return Sightings(pixels, np.array(point, dtype=np.intp), table.labels["camera"], tuple(number))
 
 
-def _table(
-    header: Sequence[str],
-    names: Sequence[str],
-    forms: str,
-    batches: Iterable[tuple[Sequence[str] | None, Array, Sequence[Sequence[Any]]]],
-) -> Iterator[str]:
-    """Text of a table, a part per batch: labels of points, numbers in these forms, and other columns."""
-    for k, (labels, numbers, others) in enumerate(batches):
-        first = [] if labels is None else [list(map(quoted_field, labels))]
+# Labels of points, numbers, and other columns.
+_Part = tuple[Iterable[str] | None, Array, Sequence[Sequence[Any]]]
+
+
+def _table(header: Sequence[str], names: Sequence[str], forms: str, parts: Iterable[_Part]) -> Iterator[str]:
+    """Text of a table, with numbers in these forms."""
+    for k, (labels, numbers, others) in enumerate(parts):
+        first = [] if labels is None else [map(quoted_field, np.asarray(labels).tolist())]
         if k == 0:
             yield "\n".join([*header, ",".join([*(["point"] if first else []), *names]), ""])
         numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
@@ -111,11 +110,11 @@ def format_space_points(
     covariances. Points whose epipolar error is beyond `limit` [px] are flagged.
     """
 
-    def columns(found: Triangulated, labels: NDArray[Any] | None) -> tuple[Any, Array, list[list[str]]]:
+    def columns(found: Triangulated, labels: NDArray[Any] | None) -> _Part:
         assert found.covariance is not None
         numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
         flags = _FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
-        return None if labels is None else labels.tolist(), numbers, [flags]
+        return labels, numbers, [flags]
 
     header = [
         "# frame: left camera; X right, Y down, Z forward, the centre of its lens at 0",
@@ -150,10 +149,10 @@ def format_plane_points(
 ) -> Iterator[str]:
     """Text of a file, one part per batch of points and their names; the first includes the header."""
 
-    def columns(found: PlanePoints, labels: NDArray[Any] | None) -> tuple[Any, Array, list[list[str]]]:
+    def columns(found: PlanePoints, labels: NDArray[Any] | None) -> _Part:
         numbers = np.column_stack([found.points, found.covariance.reshape(-1, 4)[:, [0, 1, 3]]])
         flags = _FLAGS[np.where(found.seen, 0, 2)].tolist()
-        return None if labels is None else labels.tolist(), numbers, [flags]
+        return labels, numbers, [flags]
 
     header = [f"# plane: Z = 0 of the target of the view {view}", f"# unit: {unit}", f"# sigma: {sigma:.6g}"]
     names = ("X", "Y", "Z", "sXX", "sXY", "sYY", "flag")

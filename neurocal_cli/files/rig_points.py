@@ -47,12 +47,11 @@ def read_rig_points(
         if path != "-" and (board is not None or not path.lower().endswith(TABLES)):
             corners = read_corners([path], board, remarks, what="points", advice=BOARD_ADVICE)
             if corners is not None:
-                if (name or Path(path).stem) in found:
-                    raise InputError(
-                        f"the camera {name or Path(path).stem} has several files of points; give one"
-                    )
-                found[name or Path(path).stem] = corners
-                order.setdefault(name or Path(path).stem)
+                camera = name or Path(path).stem
+                if camera in found:
+                    raise InputError(f"the camera {camera} has several files of points; give one")
+                found[camera] = corners
+                order.setdefault(camera)
                 continue
         table = read_table(path, POINTS)
         for camera, part in _by_camera(table, name):
@@ -75,8 +74,7 @@ def _by_camera(table: Table, name: str) -> list[tuple[str, Table]]:
     if name and len(cameras) > 1:
         raise InputError(
             f"{table.source}: the column camera names {len(cameras)} cameras, but the file is given as "
-            f"{name}; leave "
-            "out the name"
+            f"{name}; leave out the name"
         )
     found = []
     for camera in cameras:

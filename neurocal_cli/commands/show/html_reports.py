@@ -109,7 +109,7 @@ def _rig_page(rig: Rig, origin: Origin) -> str:
         ]
         frames.append([printable(name), *errors])
     edges = [["cameras", "common frames", "cover of their images", f"distance [{printable(rig.unit)}]"]]
-    covered, place = edge_coverage(rig).covered, {name: k for k, name in enumerate(cameras)}
+    (_, covered), place = edge_coverage(rig), {name: k for k, name in enumerate(cameras)}
     for (a, b), count in rig.edges.items():
         pair, i, j = rig.pair(a, b), place[a], place[b]
         distance = with_std(pair.baseline, pair.std["baseline"])

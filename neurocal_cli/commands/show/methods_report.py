@@ -37,11 +37,12 @@ _PRINTED = {
     "t_x": 0.02, "t_y": 0.0, "t_z": 0.0, "R_x": 0.0, "R_y": -0.000027, "R_z": -0.00001,
     "alpha_u": 0.001165, "alpha_v": 0.000605, "u0": -0.017553, "v0": -0.001267, "theta": 0.0,
 }  # fmt: skip
-_KINDS = {
-    "lm": "network, trained by lm",
-    "backprop": "network, trained by backprop",
-    "weights": "plain LM on (3) from the network's random weights",
-    "camera": "plain LM on (3) from a random camera",
+# Kinds of random starts, in tables and in the picture.
+_STARTS = {
+    "lm": ("network, trained by lm", "network\nby lm"),
+    "backprop": ("network, trained by backprop", "network\nby backprop"),
+    "weights": ("plain LM on (3) from the network's random weights", "plain LM,\nrandom\nweights"),
+    "camera": ("plain LM on (3) from a random camera", "plain LM,\nrandom\ncamera"),
 }
 # Colours that colour-blind people can distinguish (Okabe and Ito), markers and their sizes.
 _LOOK = {
@@ -51,12 +52,6 @@ _LOOK = {
     "linear": ("#009e73", "s", 5.0),
     "tsai": ("#e69f00", "^", 5.5),
     "opencv": ("#56b4e9", "+", 8.0),
-}
-_STARTS = {
-    "lm": "network\nby lm",
-    "backprop": "network\nby backprop",
-    "weights": "plain LM,\nrandom\nweights",
-    "camera": "plain LM,\nrandom\ncamera",
 }
 _UNITS = {"alpha_u": "px", "alpha_v": "px"}
 _OWN = 0.9  # a method whose bound is below this share of the largest one has its own line
@@ -193,9 +188,8 @@ def simulation_tables(
     ):
         tables.append((f"{what}, at the largest sigma", _at_largest_sigma(study, cell)))
     if starts is not None:
-        rows = [
-            [_KINDS[kind], str(count), str(len(starts.rms[kind]))] for kind, count in starts.reached.items()
-        ]
+        found = starts.reached.items()
+        rows = [[_STARTS[kind][0], str(count), str(len(starts.rms[kind]))] for kind, count in found]
         title = f"single random starts that reach the minimum (noise {starts.sigma:g} px)"
         tables.append((title, [["start", "reached", "of"], *rows]))
     below = [
@@ -411,6 +405,7 @@ def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bo
 def _draw_starts(axes: Axes, starts: StartStudy) -> None:
     """Draw a bar for each kind: shares of starts that reach the minimum, another one, and no camera."""
     kinds = list(starts.rms)[::-1]
+    names = [_STARTS[kind][1] for kind in kinds]
     total = np.array([len(starts.rms[kind]) for kind in kinds])
     best = np.array([starts.reached[kind] for kind in kinds])
     lost = np.array([int(np.isinf(starts.rms[kind]).sum()) for kind in kinds])
@@ -421,7 +416,7 @@ def _draw_starts(axes: Axes, starts: StartStudy) -> None:
         (lost, "0.75", "no camera"),
     ):
         share = 100 * counts / total
-        axes.barh([_STARTS[kind] for kind in kinds], share, left=left, color=color, label=label, height=0.6)
+        axes.barh(names, share, left=left, color=color, label=label, height=0.6)
         left += share
     for row, (reached, of) in enumerate(zip(best, total, strict=True)):
         axes.text(2, row, f"{reached} of {of}", va="center", fontweight="bold")

@@ -10,7 +10,6 @@ import numpy as np
 
 from neurocal_cli.calibration.rig.evaluation import SpaceError, StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.commands.show.camera_panels import (
     Outline,
@@ -41,16 +40,12 @@ _ROWS = (("residuals", "uncertainty"), ("coverage", "scatter"), ("poses", "learn
 Draw = Callable[["Axes"], None]
 
 
-@frozen_dataclass(eq=False)
-class EdgeCoverage:
-    """Of each camera (row): what it sees in the frames that it has in common with each other (column)."""
+def edge_coverage(rig: Rig) -> tuple[Array, Array]:
+    """What each camera (row) sees in the frames that it has in common with each other (column).
 
-    frames: Array  # (C, C) number of common frames; on the diagonal, of all views
-    covered: Array  # (C, C) share of the image's parts that hold points then
-
-
-def edge_coverage(rig: Rig) -> EdgeCoverage:
-    """What pairs of cameras see together."""
+    Returns their number (C, C), on the diagonal that of all views, and the share (C, C) of the image's parts
+    that hold points then.
+    """
     names = list(rig.cameras)
     frames, covered = np.zeros((len(names),) * 2), np.zeros((len(names),) * 2)
     for a, name in enumerate(names):
@@ -65,20 +60,21 @@ def edge_coverage(rig: Rig) -> EdgeCoverage:
             seen = np.array([view in both or a == b for view in camera.points.view_names])
             frames[a, b] = seen.sum()
             covered[a, b] = len(np.unique(cell[seen[camera.points.view_index]])) / _CELLS**2
-    return EdgeCoverage(frames, covered)
+    return frames, covered
 
 
 def draw_edges(axes: Axes, rig: Rig) -> None:
     """Draw for each pair of cameras how much of the row's image is covered in their common frames."""
-    found, names = edge_coverage(rig), [plain(name[-16:]) for name in rig.cameras]
-    shown = np.where(found.frames > 0, found.covered, np.nan)
+    names = [plain(name[-16:]) for name in rig.cameras]
+    frames, covered = edge_coverage(rig)
+    shown = np.where(frames > 0, covered, np.nan)
     drawn = axes.imshow(shown, cmap="Blues", vmin=0, vmax=1.2)
     places = range(len(names))
     axes.set_xticks(places, names, rotation=90 if len(names) > 4 else 0)
     axes.set_yticks(places, names)
     if len(names) <= _MOST_NUMBERS:
-        for (row, column), count in np.ndenumerate(found.frames):
-            cover = f"{count:.0f}\n{found.covered[row, column]:.0%}" if count else ""
+        for (row, column), count in np.ndenumerate(frames):
+            cover = f"{count:.0f}\n{covered[row, column]:.0%}" if count else ""
             axes.text(column, row, cover, ha="center", va="center", fontsize=7)
     style(axes, "Frames in common with the camera of the column,\nand how much of the row's image they cover")
     axes.grid(False)

@@ -16,7 +16,7 @@ from neurocal_cli.commands.show.camera_report import parameter_rows
 from neurocal_cli.commands.show.html_page import table, verdict_block
 from neurocal_cli.commands.show.rig_report import pose_rows, rig_rows, side_rows
 from neurocal_cli.commands.show.text import Table
-from neurocal_cli.commands.show.zoom_report import network_rows
+from neurocal_cli.commands.show.zoom_report import draw_lens, network_rows
 from neurocal_cli.errors import InputError, UsageError, check_choice
 
 if TYPE_CHECKING:
@@ -95,8 +95,6 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
             raise UsageError("this result has a single picture; leave out panel")
         check_choice("panel", panel, (*panels, "next") if isinstance(result, Calibration) else panels)
     if isinstance(result, ZoomLens):
-        from neurocal_cli.commands.show.zoom_report import draw_lens
-
         return Picture(draw_lens(result, kind))
     from neurocal_cli.commands.show.plot_pages import draw_camera, draw_rig, draw_stereo
 
