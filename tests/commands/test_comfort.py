@@ -212,3 +212,11 @@ def test_an_image_of_another_size_is_explained(tmp_path: Path) -> None:
     }.items():
         (line,) = [line for line in result.stderr.splitlines() if line.startswith(f"{name}: ")]
         assert why in line
+
+
+def test_every_command_computes_in_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("OMP_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        monkeypatch.setenv(name, "2")
+    monkeypatch.delenv("VECLIB_MAXIMUM_THREADS")
+    assert run("sample", tmp_path / "sample_data").exit_code == 0
+    assert (os.environ["VECLIB_MAXIMUM_THREADS"], os.environ["OMP_NUM_THREADS"]) == ("1", "2")

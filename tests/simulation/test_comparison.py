@@ -167,6 +167,25 @@ def test_what_simulate_saves_can_be_calibrated_and_detected(tmp_path: Path) -> N
     assert json.loads(again.stdout)["truth"]["alpha_u"] == pytest.approx(556.0)
 
 
+def test_the_simulated_board_may_be_described_in_short() -> None:
+    words = (
+        "--views",
+        2,
+        "--sigma",
+        0.2,
+        "--trials",
+        1,
+        "--random-starts",
+        0,
+        "--methods",
+        "linear",
+        "--json",
+    )
+    done = run("simulate", "--board", "chessboard:5x4:30", *words)
+    assert done.exit_code == 0, done.stderr
+    assert json.loads(done.stdout)["n_points"] == 2 * (4 * 4 + 5 * 3)
+
+
 @pytest.mark.slow
 def test_table_2_on_a_corner_of_three_boards(real_files: RealFiles, tmp_path: Path) -> None:
     """The paper's section 5.2 with photographs: one pair of a target that is not flat."""
