@@ -9,11 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from simulated_zoom import SimulatedZoom
+from simulated_zoom import SimulatedZoom, write_lens_points
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.files.lens_files import write_lens_points
 from neurocal_cli.files.points_csv import write_points
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences

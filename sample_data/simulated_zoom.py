@@ -13,6 +13,7 @@ With z and f the zoom and focus encoders as shares of their range:
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose, entries_of
 from neurocal_cli.camera.projection import image_points
+from neurocal_cli.files.points_csv import format_points
+from neurocal_cli.files.writing import write_whole
 from neurocal_cli.observations.points import Correspondences
 
 
@@ -122,3 +125,14 @@ def see(
     points = Correspondences(world.reshape(-1, 3), np.round(pixels, 5).reshape(-1, 2), names, image_size)
     columns = np.repeat(np.asarray(settings, dtype=float), per, axis=0).T
     return LensPoints.grouped(points, dict(zip(("zoom", "focus"), columns, strict=False)))
+
+
+def write_lens_points(lens: LensPoints, path: str | Path) -> None:
+    """Write points with the columns of their settings; they read back to the last bit."""
+    lines = format_points(lens.points).split("\n")
+    first = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+    settings = [",".join(map(repr, row)) for row in lens.settings.tolist()]
+    lines[first] = ",".join([*lens.controls, lines[first]])
+    for k, s in enumerate(lens.point_setting.tolist(), start=first + 1):
+        lines[k] = f"{settings[s]},{lines[k]}"
+    write_whole(path, "\n".join(lines))

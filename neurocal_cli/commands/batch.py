@@ -19,7 +19,6 @@ from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.commands.batch_jobs import Job, Outcome
-    from neurocal_cli.commands.batch_run import Task
 
 _CSV, _HTML = "summary.csv", "summary.html"
 _MOST_TOLD = 10  # problems of jobs
@@ -209,7 +208,7 @@ class _Batch:
 
     def _do_jobs(self) -> None:
         from neurocal_cli.commands.batch_jobs import Outcome
-        from neurocal_cli.commands.batch_run import Task, do_job, unchanged
+        from neurocal_cli.commands.batch_run import Task, do_job, receive, unchanged, with_inputs
 
         tasks = []
         for job in self._jobs:
@@ -223,10 +222,14 @@ class _Batch:
         if not tasks:
             return
         n_before, stopped = len(self._outcomes), 0
+        sent = map(with_inputs, tasks) if self._ship else tasks  # read when it is their turn
         with ProgressBar() as progress:
             progress(f"0 of {len(tasks)} jobs", 0.0)
-            for task, result in self._run()(do_job, self._sent(tasks)):
-                outcome = self._received(task, result)
+            for task, result in self._run()(do_job, sent):
+                if result is None:
+                    outcome = Outcome("failed", "its process was killed twice, perhaps for lack of memory")
+                else:
+                    outcome = receive(task, result) if self._ship else result
                 self._outcomes[task.job.name] = outcome
                 stopped = stopped + 1 if outcome.status == "stopped" else 0
                 if stopped >= _STOPPED:
@@ -242,21 +245,6 @@ class _Batch:
                     f"{n} of {len(tasks)} jobs, {rate:.3g}/s, {time.strftime('%H:%M:%S', left)} left",
                     n / len(tasks),
                 )
-
-    def _sent(self, tasks: list[Task]) -> Iterator[Task]:
-        """The tasks, with their inputs if these are sent; read when it is their turn."""
-        from neurocal_cli.commands.batch_run import with_inputs
-
-        for task in tasks:
-            yield with_inputs(task) if self._ship else task
-
-    def _received(self, task: Task, result: Outcome | None) -> Outcome:
-        from neurocal_cli.commands.batch_jobs import Outcome
-        from neurocal_cli.commands.batch_run import receive
-
-        if result is None:
-            return Outcome("failed", "its process was killed twice, perhaps for lack of memory")
-        return receive(task, result) if self._ship else result
 
     def _compared(self, former: dict[tuple[str, str], str]) -> dict[tuple[str, str], dict[str, Any]]:
         """What changed since an earlier batch, by the names of job and camera."""

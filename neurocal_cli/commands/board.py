@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -92,9 +94,13 @@ def board(
         None if board.is_file and boards == 1 else f"{os.path.splitext(one)[0]}.yaml" for one in outputs
     ]
     preparation.check((board.file,), (*outputs, *beside))
+    from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
+    from neurocal_cli.files.board_yaml import write_board
     from neurocal_cli.observations.marked_cells import numbered_apart, to_print
     from neurocal_cli.observations.printed_sheet import default_board, on_paper, paper_size
 
+    made: dict[str, Callable[[Sheet], str | bytes]] = {".svg": board_svg, ".pdf": board_pdf}
+    draw = made.get(ending, partial(board_png, dpi=dpi))
     size = paper_size(paper)
     sized = (board.file, board.square, board.unit) != (None,) * 3
     target = (board.read() if sized else None) or default_board(size, *board.counts)
@@ -103,11 +109,8 @@ def board(
     several = (target,) if boards == 1 else numbered_apart(target, boards)
     targets = [replace(one, planes=tuple(map(to_print, one.planes))) for one in several]
     sheets = [on_paper(one, size) for one in targets]
-    for path, sheet in zip(outputs, sheets, strict=True):
-        _draw(path, sheet, dpi)
-    from neurocal_cli.files.board_yaml import write_board
-
-    for one, sheet, file in zip(targets, sheets, beside, strict=True):
+    for one, sheet, path, file in zip(targets, sheets, outputs, beside, strict=True):
+        write_whole(path, draw(sheet))
         if file is not None:
             write_board(one, file)
         _report(one, sheet, file, as_json)
@@ -172,15 +175,6 @@ def target(camera: str, file: str | None, plots: Plots, as_json: bool, output: s
     suggest(output, "neurocal detect IMAGE... --board {} -o points.csv")
     found = calibration.target, calibration.unit
     summarise(as_json, target_json(*found) or {}, *target_lines(*found))
-
-
-def _draw(path: str, sheet: Sheet, dpi: float) -> None:
-    from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
-
-    if path.lower().endswith(".png"):
-        write_whole(path, board_png(sheet, dpi))
-    else:
-        write_whole(path, board_svg(sheet) if path.lower().endswith(".svg") else board_pdf(sheet))
 
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:

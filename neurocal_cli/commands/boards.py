@@ -239,15 +239,11 @@ def compare_markers(paths: Sequence[str], board: Board) -> None:
         found = agreed_markers(seen) if seen else None
     except NeurocalError:  # they do not tell the board, or cannot be read, which detection says
         return
-    shown = None if found is None else found.plane
     # Of several boards with different numbers, another one may be seen best.
-    if (
-        found is None
-        or shown is None
-        or shown.markers is None
-        or (shown.markers.first_id != plane.markers.first_id)
-    ):
+    own = None if found is None else found.plane.markers
+    if found is None or own is None or own.first_id != plane.markers.first_id:
         return
+    shown = found.plane
     told = f"the images show {found_words(shown)}; the board was described otherwise"
     if isinstance(shown, TagPlane) != isinstance(plane, TagPlane) or shown.cols != plane.cols:
         raise NoBoardError(f"{told}: correct its description, or leave it out")

@@ -119,7 +119,8 @@ class Command(click.Command):
             if isinstance(kind, click.Choice):
                 return f"{error.param.opts[0]} is missing; choose from {', '.join(map(str, kind.choices))}."
             return f"{error.param.opts[0]} is missing; give {error.param.opts[0]} {error.param.metavar}."
-        images = _images(words) if type(error) is click.UsageError and self._reads_points() else []
+        points = any(".csv" in metavar for metavar, _ in arguments(self))
+        images = _images(words) if points and type(error) is click.UsageError else []
         return _points_first(images) if images else None
 
     def _check_files(self, ctx: click.Context) -> None:
@@ -132,11 +133,8 @@ class Command(click.Command):
                 if set(file) & set("*?[") and not os.path.exists(file):
                     from glob import glob
 
-                    advice = (
-                        "leave out the quotes, so that the shell names the files"
-                        if glob(file)
-                        else "check the path"
-                    )
+                    unquote = "leave out the quotes, so that the shell names the files"
+                    advice = unquote if glob(file) else "check the path"
                     raise FormatError(f"is a pattern, not a file; {advice}", file)
             for folder in filter(os.path.isdir, files):
                 if images := _images(sorted(os.listdir(folder))):
@@ -148,9 +146,6 @@ class Command(click.Command):
             mistaken = _images(files[:1]) or [file for file in files[:1] if file.lower().endswith(".csv")]
             if mistaken and any(file.lower().endswith((".yaml", ".yml")) for file in files[1:]):
                 raise click.UsageError(f"{usage[0]} stands first: {ctx.command_path} {' '.join(usage)}", ctx)
-
-    def _reads_points(self) -> bool:
-        return any(".csv" in metavar for metavar, _ in arguments(self))
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the arguments, then the options."""

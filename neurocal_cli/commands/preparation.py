@@ -43,7 +43,10 @@ def check(
     check_one_stdin(*inputs)
     check_summary(as_json, *outputs)
     for picture in pictures:
-        _check_plot(picture)
+        if not picture.lower().endswith(_PICTURES):
+            endings = options.one_of(" ".join(_PICTURES))
+            raise UsageError(f"--plot {picture}: not a picture file; give a name that ends in {endings}")
+        check_available()
     check_outputs((*outputs, *pictures), inputs)
 
 
@@ -205,14 +208,6 @@ def plot_result(plots: Plots, result: Calibration | StereoRig | Rig | ZoomLens) 
         from neurocal_cli.commands.show.results import plot
 
         write_plots(plots, plot, result)
-
-
-def _check_plot(plot: str) -> None:
-    """Refuse a picture that cannot be drawn, before any work is done."""
-    if not plot.lower().endswith(_PICTURES):
-        endings = options.one_of(" ".join(_PICTURES))
-        raise UsageError(f"--plot {plot}: not a picture file; give a name that ends in {endings}")
-    check_available()
 
 
 def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:

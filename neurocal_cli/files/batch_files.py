@@ -327,18 +327,13 @@ _LAST = (
 )  # fmt: skip
 
 
-def columns_of(rows: Sequence[Row]) -> list[str]:
-    """The columns of rows in their order: the common ones, and the parameters that any camera has."""
-    others = (*_FIRST, *_LAST, "log")  # the last is for the page
-    middle = dict.fromkeys(key for row in rows for key in row if key not in others)
-    return [*_FIRST, *middle, *_LAST]
-
-
 def format_fleet(rows: Sequence[Row]) -> str:
     """Text of the summary; numbers read back exactly, and what is unknown is empty."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    columns = columns_of(rows)
+    others = (*_FIRST, *_LAST, "log")  # the last is for the page
+    parameters = dict.fromkeys(key for row in rows for key in row if key not in others)  # of any camera
+    columns = [*_FIRST, *parameters, *_LAST]
     writer.writerow(columns)
     for row in rows:
         writer.writerow(["" if row.get(column) is None else row[column] for column in columns])

@@ -192,18 +192,14 @@ def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
     unreadable files: this is only an early check for different cameras, and decoding reports other problems.
     """
     for path in paths:
-        size = None if path == "-" else _stated_size(path)
+        try:
+            with open(path, "rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+                reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
+                header = None if reader is None else reader(data, False)
+                size = None if header is None else (header.width, header.height)
+        except (OSError, ValueError, IndexError, struct.error, _TruncatedError):
+            size = None
         yield None if size is None else (max(size), min(size))
-
-
-def _stated_size(path: str) -> tuple[int, int] | None:
-    try:
-        with open(path, "rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-            reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
-            header = None if reader is None else reader(data, False)
-            return None if header is None else (header.width, header.height)
-    except (OSError, ValueError, IndexError, struct.error, _TruncatedError):
-        return None
 
 
 def _png(data: Data, whole: bool) -> Header:

@@ -27,15 +27,16 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
+from neurocal_cli.files.camera_tree import read_tree
 from neurocal_cli.files.exchange.reading import read_intrinsics
 from neurocal_cli.files.key_tables import Columns, Keys, Kind, check_format, inline, record
-from neurocal_cli.files.points_csv import POINTS, correspondences, format_points
+from neurocal_cli.files.points_csv import POINTS, correspondences
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.table import Table, parse_table
 from neurocal_cli.files.table_header import Schema, column_names
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, quoted, read_yaml, text
+from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, quoted, text
 
 _FORMAT = 2
 _BLOCK = "neurocal_lens"
@@ -62,7 +63,7 @@ def read_lens(path: str | Path) -> ZoomLens:
     FormatError
         The file cannot be read, is another kind of file, or a key is missing or wrong.
     """
-    root = read_yaml(path)
+    root = read_tree(path)
     if _BLOCK not in root:
         kind = "is a camera" if "camera_matrix" in root else "is not a lens"
         root.refuse(f"{kind}; give a file that `neurocal lens fit` wrote")
@@ -293,17 +294,6 @@ def read_lens_points(
     if not isinstance(data, LensPoints):
         raise FormatError("has known cameras, not points; give columns X,Y,Z,u,v", data.source)
     return data
-
-
-def write_lens_points(lens: LensPoints, path: str | Path) -> None:
-    """Write points with the columns of their settings; they read back to the last bit."""
-    lines = format_points(lens.points).split("\n")
-    first = next(k for k, line in enumerate(lines) if not line.startswith("#"))
-    settings = [",".join(map(repr, row)) for row in lens.settings.tolist()]
-    lines[first] = ",".join([*lens.controls, lines[first]])
-    for k, s in enumerate(lens.point_setting.tolist(), start=first + 1):
-        lines[k] = f"{settings[s]},{lines[k]}"
-    write_whole(path, "\n".join(lines))
 
 
 def _points(tables: list[Table], notes: list[str]) -> LensPoints:

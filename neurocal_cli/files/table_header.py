@@ -95,10 +95,9 @@ def _meant(line: str) -> str | None:
 
 
 def _size(text: str) -> tuple[int, int] | None:
-    words = re.split(r"[ \t,]+", text)
-    if len(words) != 2 or not all(re.fullmatch("[0-9]{1,6}", word) and int(word) for word in words):
-        return None
-    return int(words[0]), int(words[1])
+    found = re.fullmatch(r"([0-9]{1,6})[ \t,]+([0-9]{1,6})", text)
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    return size if all(size) else None
 
 
 def _centre(text: str) -> tuple[float, float] | None:

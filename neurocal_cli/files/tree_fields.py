@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -63,10 +63,6 @@ class Field:
         """Value of a key, or a default if the key is missing or null."""
         found = self._mapping().get(key)
         return Field(default if found is None else found, self.source, self._below(key))
-
-    def first(self, keys: Iterable[str]) -> Field | None:
-        """Value of the first of these keys that is there and not null; None without any."""
-        return next((self[key] for key in keys if key in self), None)
 
     def called(self, names: str) -> Field | None:
         """Value of the first of these names, without capitals and marks, that is there and not null."""

@@ -19,7 +19,6 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -27,8 +26,6 @@ import yaml
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.reading import read_text
-from neurocal_cli.files.tree_fields import Field
 
 DEEPEST = 40
 TOO_DEEP = "is nested too deeply to be a camera file; give another"
@@ -156,12 +153,6 @@ def _with_point(numbers: str) -> str:
         if not part[-2:-1] or part[-2] not in "0123456789.":  # a single digit stands before the e
             parts[k] = part + ".0"
     return "e".join(parts)
-
-
-def read_yaml(path: str | Path) -> Field:
-    """Read a YAML file as a tree; see `parse_yaml`."""
-    text, source = read_text(path, "a YAML file")
-    return Field(parse_yaml(text, source), source)
 
 
 def parse_yaml(text: str, source: str) -> Any:

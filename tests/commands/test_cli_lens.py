@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
+from simulated_zoom import write_lens_points
 from support.command_line import run
 from support.zoom_laws import FLOOR, between, grid, seen
 
@@ -24,7 +25,6 @@ from neurocal_cli.files.lens_files import (
     read_lens_data,
     read_lens_points,
     write_lens,
-    write_lens_points,
 )
 
 CAMERAS = "zoom,alpha_u,alpha_v,u0,v0\n" + "".join(

@@ -50,11 +50,9 @@ def calibration_report(calibration: Calibration) -> str:
     size, points = calibration.image_size, calibration.points
     given = _GIVEN[calibration.type]
     if fixed := fixed_intrinsics(calibration):
-        given = (
-            f"{given} but {', '.join(fixed)}" if calibration.type == 1 else f"{given}, and {', '.join(fixed)}"
-        )
+        given += f"{' but' if calibration.type == 1 else ', and'} {', '.join(fixed)}"
     if calibration.square_pixels:
-        given = f"{given}, square pixels"
+        given += ", square pixels"
     headline = (
         f"{printable(calibration.camera_name)}: type {calibration.type} ({given}), "
         f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
