@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.streams import ProgressBar, answer, suggest
-
-if TYPE_CHECKING:
-    from neurocal_cli.files.tree_fields import Field
 
 
 @click.command(cls=options.Command)
@@ -46,35 +41,31 @@ def advise(calibration: str, count: int, plots: Plots, as_json: bool) -> None:
       neurocal advise rig.yaml --next 1
     """  # noqa: D301 - as in the group
     preparation.check((calibration,), plots=plots)
+    from neurocal_cli.calibration.advice import advise as weigh
+    from neurocal_cli.calibration.rig.advice import advise_rig
+    from neurocal_cli.commands.show import advice as show
+    from neurocal_cli.files.calibration_yaml import calibration_from_field
     from neurocal_cli.files.camera_tree import own_kind, read_tree
+    from neurocal_cli.files.rig_yaml import rig_from_field
 
     root = read_tree(calibration)
     if own_kind(root) in ("stereo", "rig"):
-        _advise_rig(root, count, plots, as_json)
+        rig = rig_from_field(root)
+        with ProgressBar("comparing views"):
+            ties = advise_rig(rig, count)
+        answer(as_json, lambda: show.rig_advice_json(ties), lambda: "\n".join(show.rig_advice_lines(ties)))
+        write_plots(plots, show.draw_rig_advice, ties, rig)
         return
-    from neurocal_cli.calibration.advice import advise as weigh
-    from neurocal_cli.commands.show.advice import advice_json, advice_lines, draw_advice
-    from neurocal_cli.files.calibration_yaml import calibration_from_field
-
     known = calibration_from_field(root)
     with ProgressBar("comparing views"):
         advice = weigh(known, count)
-    answer(as_json, lambda: advice_json(advice), lambda: "\n".join(advice_lines(advice, known.verdict)))
-    write_plots(plots, draw_advice, advice, known)
+    answer(
+        as_json,
+        lambda: show.advice_json(advice),
+        lambda: "\n".join(show.advice_lines(advice, known.verdict)),
+    )
+    write_plots(plots, show.draw_advice, advice, known)
     if plots:
         suggest(calibration, "photograph these views, and calibrate from all images")
     elif not as_json:
         suggest(calibration, "neurocal advise {} --plot next.png")
-
-
-def _advise_rig(root: Field, count: int, plots: Plots, as_json: bool) -> None:
-    """Advise views that tie the cameras of a rig."""
-    from neurocal_cli.calibration.rig.advice import advise_rig
-    from neurocal_cli.commands.show.advice import draw_rig_advice, rig_advice_json, rig_advice_lines
-    from neurocal_cli.files.rig_yaml import rig_from_field
-
-    rig = rig_from_field(root)
-    with ProgressBar("comparing views"):
-        advice = advise_rig(rig, count)
-    answer(as_json, lambda: rig_advice_json(advice), lambda: "\n".join(rig_advice_lines(advice)))
-    write_plots(plots, draw_rig_advice, advice, rig)

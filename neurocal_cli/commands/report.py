@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import click
@@ -103,38 +104,32 @@ def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs:
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.commands.show.html_page import Origin
     from neurocal_cli.commands.show.html_reports import Result, page_of
+    from neurocal_cli.files.calibration_yaml import calibration_from_field
     from neurocal_cli.files.camera_tree import own_kind
+    from neurocal_cli.files.lens_files import lens_from_field
+    from neurocal_cli.files.rig_yaml import rig_from_field, stereo_from_field
 
-    result: Result
-    if (kind := own_kind(root)) == "lens":
-        from neurocal_cli.files.lens_files import lens_from_field
-
-        result, block, cameras, none = lens_from_field(root), None, [], "a zoom lens"
-    elif kind == "stereo":
-        from neurocal_cli.files.rig_yaml import stereo_from_field
-
-        result = rig = stereo_from_field(root)
-        block, cameras, none = root["left"], [rig.left, rig.right], ""
-    elif kind == "rig":
-        from neurocal_cli.files.rig_yaml import rig_from_field
-
-        result = found = rig_from_field(root)
-        block, cameras, none = root["cameras"][found.first], [], "a rig of named cameras"
-    else:
-        from neurocal_cli.files.calibration_yaml import calibration_from_field
-
-        result = calibration = calibration_from_field(root)
-        block, cameras, none = root, [calibration], ""
-    if images and none:
-        raise UsageError(f"the page of {none} shows no photographs; leave out --images")
-    if len(images) > len(cameras) > 0:
+    readers: dict[str, Callable[[Field], Result]]
+    readers = {"lens": lens_from_field, "stereo": stereo_from_field, "rig": rig_from_field}
+    result = readers.get(own_kind(root), calibration_from_field)(root)
+    cameras, block = [result] if isinstance(result, Calibration) else [], root
+    if isinstance(result, StereoRig):
+        cameras, block = [result.left, result.right], root["left"]
+    elif isinstance(result, Rig):
+        block = root["cameras"][result.first]
+    if images and not cameras:
+        what = "a rig of named cameras" if isinstance(result, Rig) else "a zoom lens"
+        raise UsageError(f"the page of {what} shows no photographs; leave out --images")
+    if len(images) > len(cameras):
         raise UsageError("the file is of one camera; give --images once")
     words = images * (len(cameras) if len(images) == 1 else 1)
     shown = [_photographs(*one, len(cameras)) for one in zip(cameras, words, strict=False)]
-    known = block is not None and "version" in block["neurocal"]
-    versions = {"neurocal": block["neurocal"]["version"].text()} if block is not None and known else {}
+    known = "neurocal" in block and "version" in block["neurocal"]
+    versions = {"neurocal": block["neurocal"]["version"].text()} if known else {}
     return page_of(result, Origin(files, versions=versions), shown)
 
 

@@ -190,19 +190,20 @@ def simulate(
     from neurocal_cli.files.processes import usable_cores
 
     jobs = jobs or usable_cores()
+    from neurocal_cli.commands.show import methods_report as show
+
     if rates:
-        _rates(data_sets, seed, jobs, plots, as_json)
+        from neurocal_cli.simulation.starts import study_rates
+
+        with ProgressBar() as progress:
+            found = study_rates(data_sets, seed, jobs, progress)
+        answer(as_json, lambda: show.rates_json(found), lambda: show.text_of(*show.rates_tables(found)))
+        write_plots(plots, show.draw_rates, found)
         return
     scene, paper = _scene(camera, board, views, seed)
     levels = sorted(set(sigma))
     if save is not None:
         _save(scene, save, levels, seed, images)
-    from neurocal_cli.commands.show.methods_report import (
-        draw_simulation,
-        simulation_json,
-        simulation_tables,
-        text_of,
-    )
     from neurocal_cli.simulation.comparison import study_noise
 
     with ProgressBar() as progress:
@@ -210,10 +211,10 @@ def simulate(
         starts = _starts(scene, random_starts, seed, jobs, progress)
     answer(
         as_json,
-        lambda: simulation_json(scene, seed, study, starts),
-        lambda: text_of(*simulation_tables(study, starts, paper)),
+        lambda: show.simulation_json(scene, seed, study, starts),
+        lambda: show.text_of(*show.simulation_tables(study, starts, paper)),
     )
-    write_plots(plots, draw_simulation, study, starts, scene.unit)
+    write_plots(plots, show.draw_simulation, study, starts, scene.unit)
 
 
 def _scene(
@@ -258,16 +259,6 @@ def _starts(
     except DegenerateGeometryError as error:
         note(f"no random starts: {error}")
         return None
-
-
-def _rates(data_sets: int, seed: int, jobs: int, plots: Plots, as_json: bool) -> None:
-    from neurocal_cli.commands.show.methods_report import draw_rates, rates_json, rates_tables, text_of
-    from neurocal_cli.simulation.starts import study_rates
-
-    with ProgressBar() as progress:
-        study = study_rates(data_sets, seed, jobs, progress)
-    answer(as_json, lambda: rates_json(study), lambda: text_of(*rates_tables(study)))
-    write_plots(plots, draw_rates, study)
 
 
 def _rig(
