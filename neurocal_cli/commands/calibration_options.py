@@ -51,43 +51,45 @@ class Estimation:
 
     def check(self) -> None:
         """Refuse options that contradict each other, before any file is read, with a UsageError."""
-        self._require("image_center", "type", "2")
-        self._require("intrinsics", "type", "3")
-        self._require("extrinsics", "type", "4")
         if self.type == "3" and self.intrinsics is None:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
             raise UsageError("--type 4 needs the known poses; give --extrinsics CAMERA.yaml")
-        if self.no_skew and self.skew != "free":
-            raise UsageError(f"--no-skew is --skew fixed, but --skew is {self.skew}; give one of them")
-        given = {
-            "--skew auto": self.skew == "auto", "--skew": self.skew != "free", "--no-skew": self.no_skew,
-            "--fix": bool(self.fix), "--square-pixels": self.square_pixels,
-        }  # fmt: skip
-        for option in (option for option, is_given in given.items() if is_given):
-            if self.type == "3" and option != "--skew auto":
+        angles = {
+            "--no-skew": self.no_skew,
+            "--square-pixels": self.square_pixels,
+            "--fix theta=90": "theta" in self._fixed(),
+        }
+        of_camera = {"--skew": self.skew != "free", **angles, "--fix": bool(self.fix)}
+        for option in (option for option, is_given in of_camera.items() if is_given):
+            if self.type == "3":
                 raise UsageError(f"--type 3 does not change the given camera; leave out {option}")
-            if self.method != "neuro" and option not in ("--skew", "--no-skew"):
-                raise UsageError(
-                    f"{option} needs --method neuro, but the method is {self.method}; leave it out"
-                )
-        if self.square_pixels and self.skew == "auto":
-            raise UsageError("--square-pixels is --skew fixed, but --skew is auto; give one of them")
+            if self.skew == "auto" and option in angles:
+                raise UsageError(f"{option} is --skew fixed, but --skew is auto; give one of them")
         if self.square_pixels and self.distortion == "plumb-line":
             raise UsageError(
                 "--square-pixels does not go with --distortion plumb-line; name k1k2p1p2 instead"
             )
-        self._fixed()
-        if self.trainer != "lm" and self.method != "neuro":
-            raise UsageError(
-                f"--trainer {self.trainer} needs --method neuro, but the method is {self.method}; leave out "
-                "--trainer"
-            )
+        for option, is_given, other, wanted in (
+            ("--image-center", self.image_center is not None, "type", "2"),
+            ("--intrinsics", self.intrinsics is not None, "type", "3"),
+            ("--extrinsics", self.extrinsics is not None, "type", "4"),
+            ("--epochs", self.epochs is not None, "trainer", "backprop"),
+            ("--rate", self.rate is not None, "trainer", "backprop"),
+            ("--rate-gamma", self.rate_gamma is not None, "trainer", "backprop"),
+            (f"--trainer {self.trainer}", self.trainer != "lm", "method", "neuro"),
+            ("--skew auto", self.skew == "auto", "method", "neuro"),
+            ("--square-pixels", self.square_pixels, "method", "neuro"),
+            ("--fix", bool(self.fix), "method", "neuro"),
+        ):
+            if is_given and (value := getattr(self, other)) != wanted:
+                need = f"--{other} {wanted}"
+                raise UsageError(
+                    f"{option} needs {need}, but the {other} is {value}; give {need}, or leave it out"
+                )
         if self.method != "neuro":
             unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
             options.note_unused(f"with --method {self.method}", *unused)
-        for name in _BACKPROP:
-            self._require(name, "trainer", "backprop")
 
     def _fixed(self) -> dict[str, float]:
         """The values of ``--fix`` by name; theta in degrees."""
@@ -101,16 +103,7 @@ class Estimation:
                 raise UsageError(f"--fix gives {name} twice, and differs; keep one")
         if fixed.get("theta", 90.0) != 90.0:
             raise UsageError("--fix theta: the angle between the image axes is fixed at 90 degrees only")
-        if "theta" in fixed and self.skew == "auto":
-            raise UsageError("--fix theta=90 is --skew fixed, but --skew is auto; give one of them")
         return fixed
-
-    def _require(self, name: str, other: str, wanted: str) -> None:
-        """Refuse an option that is given, but needs another value of the other option."""
-        value = getattr(self, other)
-        if getattr(self, name) is not None and value != wanted:
-            option, need = f"--{name.replace('_', '-')}", f"--{other} {wanted}"
-            raise UsageError(f"{option} needs {need}, but the {other} is {value}; give {need}")
 
     def of_known(self, intrinsics: str) -> Estimation:
         """The same for a camera that is known, of which only the poses are estimated."""
