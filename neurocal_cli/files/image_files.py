@@ -155,15 +155,11 @@ def read_header(data: bytes, source: str) -> Header:
                 "`ffmpeg -i VIDEO -vf fps=1 frame%03d.png`",
                 source,
             )
-        if other in _PHONES:
-            raise FormatError(
-                f"is a {other} file, which is not read; convert it, as with `heif-convert IN.heic OUT.jpg`, "
-                "or let the phone save JPEG",
-                source,
-            )
-        if other is not None:
-            raise FormatError(f"is a {other} file, which is not read; save it as PNG or JPEG", source)
-        raise FormatError("is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
+        if other is None:
+            raise FormatError("is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
+        advice = "convert it, as with `heif-convert IN.heic OUT.jpg`, or let the phone save JPEG"
+        advice = advice if other in _PHONES else "save it as PNG or JPEG"
+        raise FormatError(f"is a {other} file, which is not read; {advice}", source)
     try:
         header = reader(data, True)
     except (_TruncatedError, struct.error, IndexError) as error:

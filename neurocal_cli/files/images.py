@@ -53,7 +53,8 @@ class Image:
     @property
     def notes(self) -> tuple[str, ...]:
         """Changes of the pixels that a user may not expect."""
-        return _notes(self.turned)
+        what = "as its EXIF orientation says and OpenCV does; pixel coordinates are those of the turned image"
+        return (f"{self.turned}, {what}",) if self.turned else ()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -82,19 +83,17 @@ def read_image(path: str | Path) -> Image:
 
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
     """Read an image with its colours (R, G, B; no transparency), its name, and notes as of an `Image`."""
-    data, source = read_bytes(path)
-    pixels, turned = _upright(data, source, _MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    return _reversed(pixels), source, _notes(turned)
+    image = _upright(*read_bytes(path), _MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    return _reversed(image.grey), image.source, image.notes
 
 
 def parse_image(data: bytes, source: str = "image", most_pixels: int = _MOST_PIXELS) -> Image:
     """Read an image from the bytes of a file; see `read_image`."""
-    grey, turned = _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    return Image(grey, source, turned)
+    return _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
 
 
-def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pixels, str]:
-    """Pixels of a file with its EXIF orientation applied, and what that did to them."""
+def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> Image:
+    """The image of a file, grey or not as OpenCV's flags say, with its EXIF orientation applied."""
     header = read_header(data, source)
     if header.width * header.height > most_pixels:
         raise FormatError(
@@ -102,16 +101,7 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
             "read; scale it down",
             source,
         )
-    return _decoded(data, header, source, flags), _TURNS.get(header.orientation, "")
-
-
-def _notes(turned: str) -> tuple[str, ...]:
-    if not turned:
-        return ()
-    return (
-        f"{turned}, as its EXIF orientation says and OpenCV does; pixel coordinates are those of the turned "
-        "image",
-    )
+    return Image(_decoded(data, header, source, flags), source, _TURNS.get(header.orientation, ""))
 
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:

@@ -70,11 +70,10 @@ def has_sightings(path: str | Path) -> bool:
     return {"camera", "u", "v"} <= set(column_names(head, SIGHTINGS))
 
 
-def read_sightings(path: str | Path, notes: list[str] | None = None) -> Sightings:
+def read_sightings(path: str | Path, notes: list[str]) -> Sightings:
     """Read a long table of pixels; remarks on columns that are not used are appended to `notes`."""
     table = read_table(path, SIGHTINGS)
-    if notes is not None:
-        table.note_unknown(notes)
+    table.note_unknown(notes)
     pixels, number = _pixels(table, ("u", "v")), dict[str, int]()
     point = [number.setdefault(str(name), len(number)) for name in table.labels["point"]]
     return Sightings(pixels, np.array(point, dtype=np.intp), table.labels["camera"], tuple(number))

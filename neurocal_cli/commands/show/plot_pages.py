@@ -177,7 +177,7 @@ def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> 
     return _page(rows, (1,) * len(rows), panels, title, size, kind)
 
 
-def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
+def draw_rig(rig: Rig, kind: str = "png") -> bytes:
     """Draw the cameras of a rig with the targets of all frames in space, and what pairs see together."""
     others = [(rig.cameras[name].camera, pose) for name, pose in list(rig.poses.items())[1:]]
     panels: dict[str, Draw] = {
