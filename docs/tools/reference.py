@@ -147,7 +147,7 @@ def _list(title: str, rows: list[tuple[str, str]]) -> list[str]:
 
 def _formats_page() -> str:
     """Each format of other programs, from the tables by which it is read and written."""
-    every = [*READ, *(one for one in FORMATS.values() if not one.is_read)]
+    every = [*READ, *(one for one in FORMATS.values() if not one.told)]
     rows = [
         "| program | files | `--to` | cameras | poses between them | poses of views | skew | first pixel |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -159,10 +159,10 @@ def _formats_page() -> str:
             one.program,
             one.files,
             f"`{one.to}`" if one.is_written else "read only",
-            "any number" if one.most_cameras > 2 else str(one.most_cameras),
-            (one.rig or "no") + (", in metres" if one.metres else ""),
+            "any number" if one.most > 2 else str(one.most),
+            (one.rig or "no") + (", in metres" if one.rig and one.metres else ""),
             "yes" if one.poses else "no",
-            "yes" if one.skew else "no",
+            "yes" if one.holds_skew else "no",
             pixels[one.first_pixel],
         ]
         rows.append("| " + " | ".join(cells) + " |")

@@ -20,37 +20,13 @@ from typing import Any
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import STILL, CameraSet, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, listed, table
-from neurocal_cli.files.exchange.tree_paths import python_text, under, yaml_text
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.tree_paths import python_text, yaml_text
 from neurocal_cli.files.tree_fields import Field
 
-
-def _of_list(key: str, start: int, count: int) -> tuple[str, ...]:
-    """Paths of some entries of a list."""
-    return tuple(f"{key}/{k}" for k in range(start, start + count))
-
-
-_FOUR = _of_list("distortion_coeffs", 0, 4)
-_AFTER_1, _AFTER_2 = _of_list("intrinsics", 1, 4), _of_list("intrinsics", 2, 4)
-_KALIBR = CameraKeys(
-    "Kalibr",
-    _of_list("intrinsics", 0, 4),
-    (
-        Lens(("pinhole-radtan",), "k1k2p1p2", _FOUR),
-        Lens(("pinhole-none", "pinhole"), "none", ()),
-        Lens(("pinhole-equidistant", "pinhole-equi"), "fisheye", _FOUR),
-        Lens(("omni-radtan",), "omnidir", ("intrinsics/0", *_FOUR), _AFTER_1),
-        Lens(("omni-none", "omni"), "omnidir", ("intrinsics/0", *4 * (NOTHING,)), _AFTER_1),
-        Lens(("ds-none", "ds"), "double_sphere", _of_list("intrinsics", 0, 2), _AFTER_2),
-        Lens(("eucm-none", "eucm"), "eucm", _of_list("intrinsics", 0, 2), _AFTER_2),
-    ),
-    model="camera_model,distortion_model",
-    size=("resolution",),
-)
-_STEP, _IMU, _OF_IMU = PoseKeys(("T_cn_cnm1",)), PoseKeys(("T_cam_imu",)), PoseKeys(("T_imu_cam",), back=True)
+_STEP, _IMU, _OF_IMU = PoseKeys("T_cn_cnm1"), PoseKeys("T_cam_imu"), PoseKeys("T_imu_cam", back=True)
 
 
 def _kalibr_parts(document: Document) -> dict[str, Field]:
@@ -90,39 +66,36 @@ def _camchain(trees: list[Tree], cameras: CameraSet) -> Tree:
     return {f"cam{k}": tree for k, tree in enumerate(trees)}
 
 
-KALIBR = table(
-    _KALIBR,
-    lambda document: (
+KALIBR = Format(
+    "Kalibr",
+    "intrinsics/0-3",
+    """
+    pinhole-radtan: k1k2p1p2 distortion_coeffs/0-3
+    pinhole-none, pinhole: none
+    pinhole-equidistant, pinhole-equi: fisheye distortion_coeffs/0-3
+    omni-radtan: omnidir intrinsics/0 distortion_coeffs/0-3 of intrinsics/1-4
+    omni-none, omni: omnidir intrinsics/0 - - - - of intrinsics/1-4
+    ds-none, ds: double_sphere intrinsics/0,1 of intrinsics/2-5
+    eucm-none, eucm: eucm intrinsics/0,1 of intrinsics/2-5
+    """,
+    model="camera_model,distortion_model",
+    size="resolution",
+    told=lambda document: (
         isinstance(first := document.tree.get("cam0", document.tree), dict)
         and {"camera_model", "intrinsics"} <= set(first)
     ),
-    "camchain.yaml, also of OpenVINS, YAML",
+    files="camchain.yaml, also of OpenVINS, YAML",
     parts=_kalibr_parts,
     pose=_kalibr_poses,
     write=yaml_text,
     whole=_camchain,
-    most_cameras=99,
     metres=True,
     needs_size=True,
     rig="`T_cn_cnm1` from the camera before; `T_cam_imu`; `T_imu_cam` into the IMU",
 )
 
+
 # BoofCV, also its stereo rigs: ``rightToLeft`` maps the right camera's frame to the left one's.
-_R = under("radial_tangential/", "radial/0", "radial/1", "t1", "t2", "radial/2")
-_BOOFCV = CameraKeys(
-    "BoofCV",
-    under("pinhole/", "fx", "fy", "cx", "cy"),
-    (
-        Lens(("pinhole_radial_tangential", "pinhole", ""), "plumb_bob", _R),
-        Lens(("omnidirectional_universal",), "omnidir", ("mirror_offset", *_R[:4])),
-    ),
-    model="model",
-    size=("pinhole/width", "pinhole/height"),
-    skew="pinhole/skew",
-    optional="any",
-)
-
-
 def _boofcv_parts(document: Document) -> dict[str, Field]:
     root = document.root
     parts = {"camera": root} if "pinhole" in root else {side: root[side] for side in ("left", "right")}
@@ -140,25 +113,26 @@ def _boofcv_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-BOOFCV = table(
-    _BOOFCV,
-    lambda document: "pinhole" in document.tree or "rightToLeft" in document.tree,
-    "intrinsic.yaml, stereo.yaml",
+BOOFCV = Format(
+    "BoofCV",
+    "pinhole/fx,fy,cx,cy",
+    """
+    pinhole_radial_tangential, pinhole, : plumb_bob R/radial/0-1 R/t1,t2 R/radial/2
+    omnidirectional_universal: omnidir mirror_offset R/radial/0-1 R/t1,t2
+    """.replace("R/", "radial_tangential/"),
+    model="model",
+    size="pinhole/width,height",
+    skew="pinhole/skew",
+    optional="any",
+    told=lambda document: "pinhole" in document.tree or "rightToLeft" in document.tree,
+    files="intrinsic.yaml, stereo.yaml",
     parts=_boofcv_parts,
-    pose=PoseKeys(("rightToLeft/rotation", "rightToLeft/x,y,z"), back=True, from_first=True),
-    unit=None,
+    pose=PoseKeys("rightToLeft/rotation rightToLeft/x,y,z", back=True, from_first=True),
     rig="`rightToLeft`",
 )
 
 # multical: the pose called a_to_b maps the frame of b to that of a.
-_MULTICAL = CameraKeys(
-    "multical",
-    ("K:matrix",),
-    (Lens(("standard",), "tilted", ("dist",)), Lens(("fisheye",), "fisheye", ("dist",))),
-    model="model",
-    size=("image_size",),
-)
-_A_TO_B = PoseKeys(("R", "T"))
+_A_TO_B = PoseKeys("R T")
 
 
 def _multical_parts(document: Document) -> dict[str, Field]:
@@ -177,58 +151,46 @@ def _multical_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-MULTICAL = table(
-    _MULTICAL,
-    "cameras camera_poses",
-    "calibration.json",
+MULTICAL = Format(
+    "multical",
+    "K:matrix",
+    """
+    standard: tilted dist
+    fisheye: fisheye dist
+    """,
+    model="model",
+    size="image_size",
+    told="cameras camera_poses",
+    files="calibration.json",
     parts=_multical_parts,
     pose=_A_TO_B,
-    most_cameras=99,
+    metres=True,
     rig="`camera_poses`, `a_to_b` from b to a",
 )
 
-# Calibrator of calib.io.
-_DATA = "model/ptr_wrapper/data/"
-_IN = f"{_DATA}parameters/"
-_CALIB_IO = CameraKeys(
+# Calibrator of calib.io, whose entries are below those of its C++ classes.
+_DATA = "model/ptr_wrapper/data"
+_MOVED = PoseKeys("transform/rotation/rx,ry,rz transform/translation/x,y,z")
+CALIB_IO = Format(
     "calib.io",
-    tuple(f"{_IN}{name}/val" for name in ("f", "f", "cx", "cy")),
-    (Lens(("libCalib::CameraModelOpenCV",), "tilted", tuple(f"{_IN}{k}/val" for k in MODELS["tilted"])),),
+    " ".join(f"{_DATA}/parameters/{name}/val" for name in ("f", "f", "cx", "cy")),
+    "libCalib::CameraModelOpenCV: tilted "
+    + " ".join(f"{_DATA}/parameters/{name}/val" for name in MODELS["tilted"]),
     model="model/polymorphic_name",
-    size=under(f"{_DATA}CameraModelCRT/CameraModelBase/imageSize/", "width", "height"),
-    aspect=f"{_IN}ar/val",
+    size=f"{_DATA}/CameraModelCRT/CameraModelBase/imageSize/width,height",
+    aspect=f"{_DATA}/parameters/ar/val",
     optional="any",
     complete=True,
-)
-_MOVED = PoseKeys(("transform/rotation/rx,ry,rz", "transform/translation/x,y,z"))
-CALIB_IO = table(
-    _CALIB_IO,
-    lambda document: "Calibration" in document.tree and "libCalib" in document.text[:100_000],
-    "Calibrator's JSON",
-    parts=listed("Calibration/cameras"),
+    told=lambda document: "Calibration" in document.tree and "libCalib" in document.text[:100_000],
+    files="Calibrator's JSON",
+    parts="Calibration/cameras",
     pose=lambda parts: [_MOVED.read(part) for part in parts.values()] if len(parts) > 1 else [None],
-    unit=None,
-    most_cameras=99,
     rig="`transform` from the first camera",
 )
 
 # mrcal. OPENCV12 has the coefficients of the thin prism.
 REFERENCE = "reference"  # view name of the pose in the common world
-_MRCAL = CameraKeys(
-    "mrcal",
-    _of_list("intrinsics", 0, 4),
-    tuple(
-        Lens((f"LENSMODEL_{word}", word), ours, _of_list("intrinsics", 4, len(MODELS[ours])))
-        for word, ours in (
-            ("PINHOLE", "none"), ("OPENCV4", "k1k2p1p2"), ("OPENCV5", "plumb_bob"),
-            ("OPENCV8", "rational"), ("OPENCV12", "thin_prism"),
-        )
-    ),
-    model="lensmodel",
-    size=("imagersize",),
-    advice="convert it by mrcal-convert-lensmodel to",
-)  # fmt: skip
-_FROM_WORLD = PoseKeys(("extrinsics:vector",), needed=True, frame=REFERENCE)
+_FROM_WORLD = PoseKeys("extrinsics:vector", needed=True, frame=REFERENCE)
 _MRCAL_START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:").match
 
 
@@ -249,7 +211,7 @@ def _mrcal_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     texts = []
     placed = cameras.mounted if cameras.relative else [cameras.poses.get(REFERENCE, STILL)]
     for camera, pose in zip(cameras.cameras, placed, strict=True):
-        tree = _MRCAL.tree(camera)
+        tree = MRCAL.tree(camera)
         _FROM_WORLD.put(tree, pose)
         texts.append(python_text(tree))
     if len(texts) == 1:
@@ -258,31 +220,40 @@ def _mrcal_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {f"{name}.cameramodel": text for name, text in zip(names, texts, strict=True)}
 
 
-MRCAL = table(
-    _MRCAL,
-    lambda document: _MRCAL_START(document.text) and "'lensmodel'" in document.text,
-    ".cameramodel",
+MRCAL = Format(
+    "mrcal",
+    "intrinsics/0-3",
+    """
+    LENSMODEL_PINHOLE, PINHOLE: none
+    LENSMODEL_OPENCV4, OPENCV4: k1k2p1p2 intrinsics/4-7
+    LENSMODEL_OPENCV5, OPENCV5: plumb_bob intrinsics/4-8
+    LENSMODEL_OPENCV8, OPENCV8: rational intrinsics/4-11
+    LENSMODEL_OPENCV12, OPENCV12: thin_prism intrinsics/4-15
+    """,
+    model="lensmodel",
+    size="imagersize",
+    advice="convert it by mrcal-convert-lensmodel to",
+    told=lambda document: _MRCAL_START(document.text) and "'lensmodel'" in document.text,
+    files=".cameramodel",
     parts=_mrcal_parts,
     pose=_FROM_WORLD,
-    unit=None,
-    text=_mrcal_text,
-    most_cameras=99,
+    texts=_mrcal_text,
     needs_size=True,
     rig="a file for each camera, `extrinsics` from a common reference",
 )
 
 # OpenICC (OpenCameraCalibrator), with the lenses of Theia.
-_THEIA = under("intrinsics/radial_distortion_", "1", "2", "3", "4")
-OPENICC = table(
-    CameraKeys(
-        "OpenICC",
-        under("intrinsics/", "focal_length", "focal_length", "principal_pt_x", "principal_pt_y"),
-        (Lens(("PINHOLE",), "k1k2", _THEIA[:2]), Lens(("FISHEYE",), "fisheye", _THEIA)),
-        model="intrinsic_type",
-        size=("image_width", "image_height"),
-        skew="intrinsics/skew",
-        aspect="intrinsics/aspect_ratio",
-    ),
-    "intrinsic_type intrinsics",
-    "camera calibration of OpenCameraCalibrator, JSON",
+OPENICC = Format(
+    "OpenICC",
+    "intrinsics/focal_length intrinsics/focal_length intrinsics/principal_pt_x,principal_pt_y",
+    """
+    PINHOLE: k1k2 intrinsics/radial_distortion_1-2
+    FISHEYE: fisheye intrinsics/radial_distortion_1-4
+    """,
+    model="intrinsic_type",
+    size="image_width,image_height",
+    skew="intrinsics/skew",
+    aspect="intrinsics/aspect_ratio",
+    told="intrinsic_type intrinsics",
+    files="camera calibration of OpenCameraCalibrator, JSON",
 )

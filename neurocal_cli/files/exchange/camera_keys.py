@@ -1,13 +1,18 @@
 """Tables of the keys of one camera in a program's files, by which it is read and written.
 
-The paths of the keys are those of `tree_paths`.
+The paths of the keys are those of `tree_paths`. A lens is a line ``"names: model places"``: what the program
+calls it, by commas, of which the first is written; our name of the model; and the place of each of its
+coefficients in order, or one of the list of all. ``-`` is a coefficient that the program does not have,
+``D/*`` are our own names of all below D, and after ``of`` stand the places of the camera matrix, if they are
+not those of other lenses. Without names, all cameras have this lens. Case and punctuation of names do not
+count.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import field
+from functools import cached_property
 from itertools import accumulate, chain
 from typing import Any
 
@@ -22,8 +27,8 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.exchange.camera_names import have_gap, matrix_of, may_be_distortion
-from neurocal_cli.files.exchange.tree_paths import at, find, numbers_at, put, split
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.exchange.tree_paths import at, find, listed, numbers_at, put, split
+from neurocal_cli.files.tree_fields import Field, plain
 
 NOTHING = "-"  # the place of a coefficient that a program does not have
 _BOOLEANS = {"false": False, "true": True}  # names of lenses
@@ -32,12 +37,21 @@ _POLYNOMIAL = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_
 
 @frozen_dataclass
 class Lens:
-    """A distortion model of a program: its names, ours, and the places of our coefficients in order."""
+    """A distortion model of a program."""
 
-    words: tuple[str, ...]  # the first is written; case and punctuation do not count
+    words: tuple[str, ...]
     ours: str
-    places: tuple[str, ...]  # a path for each coefficient, or one for the list of all
-    intrinsics: tuple[str, ...] = ()  # if they are at other places than those of other lenses
+    places: list[str]
+    intrinsics: list[str]
+
+    @staticmethod
+    def of(line: str) -> Lens:
+        """The lens of a line of a table."""
+        words, _, rest = line.rpartition(": ")
+        rest, _, own = rest.partition(" of ")
+        ours, *places = rest.split()
+        starred = (place.replace("*", ",".join(MODELS[ours])) for place in places)
+        return Lens(tuple(map(str.strip, words.split(","))), ours, listed(" ".join(starred)), listed(own))
 
 
 @frozen_dataclass(eq=False)
@@ -45,10 +59,11 @@ class CameraKeys:
     """Where a program's files have the parts of one camera."""
 
     program: str
-    intrinsics: tuple[str, ...]  # fx, fy, cx, cy, or one path of them or of the camera matrix
-    lenses: tuple[Lens, ...]  # of several with one name, the last has the coefficients of the others
+    intrinsics: str = ""  # fx, fy, cx, cy, or one path of them or of the camera matrix
+    lenses: str = ""  # of several with one name, the last has the coefficients of the others
+    start: str = ""  # what stands before all keys of a file
     model: str = ""  # path of the name of the lens, or of its parts; without it, the first lens
-    size: tuple[str, ...] = ()  # width and height, or one path of both
+    size: str = ""  # width and height, or one path of both
     name: str = ""
     skew: str = ""
     aspect: str = ""  # of fy over fx, where the intrinsics have fx for both
@@ -57,27 +72,31 @@ class CameraKeys:
     by_longer_side: bool = False  # whether all are divided by the longer side of the image
     constants: Mapping[str, Any] = field(default_factory=dict)  # written as they are
     optional: str = ""  # which coefficients a file may lack: all at once, or any
-    aside: tuple[str, ...] = ()  # other numbers beside those of the camera
+    aside: str = ""  # other numbers beside those of the camera
     complete: bool = False  # whether there are no others
     advice: str = "calibrate it as"  # what to do with a camera of another model: this, one of them
+
+    @cached_property
+    def table(self) -> tuple[Lens, ...]:
+        """The lenses."""
+        return tuple(Lens.of(line) for line in self.lenses.strip().splitlines())
 
     @property
     def models(self) -> tuple[str, ...]:
         """Our names of the models that can be written, the simplest first."""
-        ours = [lens.ours for lens in self.lenses]
-        plain = [] if set(ours).isdisjoint(_POLYNOMIAL) else ["none"]
-        return tuple(dict.fromkeys([*plain, *ours]))
+        ours = [lens.ours for lens in self.table]
+        return tuple(dict.fromkeys([*([] if set(ours).isdisjoint(_POLYNOMIAL) else ["none"]), *ours]))
 
     @property
     def top(self) -> frozenset[str]:
         """The first keys of the paths of the lens, the intrinsics and the size."""
-        paths = *self.intrinsics, *self.size, *split(self.model)
-        return frozenset(path.partition(":")[0].partition("/")[0] for path in paths if path)
+        paths = *listed(self.intrinsics), *listed(self.size), *split(self.model)
+        return frozenset(self.start + path.partition(":")[0].partition("/")[0] for path in paths if path)
 
     def camera(self, root: Field, name: str = "camera") -> Camera:
         """Read a camera."""
         lens = self._lens(root)
-        paths = lens.intrinsics or self.intrinsics
+        paths = lens.intrinsics or listed(self.intrinsics)
         if len(paths) == 1:
             entries = numbers_at(root, paths[0])
             if len(entries) not in (4, 9):
@@ -93,7 +112,7 @@ class CameraKeys:
             K[0, 1] = skew.number()
         size = self.image_size(root)
         if size is None and (self.from_middle or self.by_longer_side):
-            at(root, self.size[0]).fail("the size of the images")
+            at(root, listed(self.size)[0]).fail("the size of the images")
         K[:2] *= max(size or (1,)) if self.by_longer_side else 1.0
         K[:2, 2] += (0.5 * np.array(size) if self.from_middle else 0.0) - self.first_pixel
         if self.name and (stated := find(root, self.name)) is not None:
@@ -102,9 +121,9 @@ class CameraKeys:
 
     def image_size(self, root: Field) -> tuple[int, int] | None:
         """Width and height; None if they are not there, or 0."""
-        fields = [find(root, path) for path in self.size]
+        fields = [find(root, path) for path in listed(self.size)]
         known = [entry for entry in fields if entry is not None]
-        if not known or len(known) < len(self.size):
+        if not known or len(known) < len(fields):
             return None
         entries = list(known[0].items()) if len(known) == 1 else known
         if len(entries) != 2:
@@ -116,16 +135,16 @@ class CameraKeys:
         entries = [entry for path in split(self.model) if (entry := find(root, path)) is not None]
         stated = [str(one.value).lower() if type(one.value) is bool else one.text() for one in entries]
         if not stated:
-            first = self._fullest(root, self.lenses[0])
-            others = [one for one in self.lenses if one.ours != first.ours and one.places == first.places]
+            first = self._fullest(root, self.table[0])
+            others = [one for one in self.table if one.ours != first.ours and one.places == first.places]
             if self.model and others and first.places:
                 at(root, split(self.model)[0])  # the same numbers may be those of either
             return first
-        word = _plain("".join(stated))
-        for lens in self.lenses:
-            if word in map(_plain, lens.words):
+        word = plain("".join(stated))
+        for lens in self.table:
+            if word in map(plain, lens.words):
                 return self._fullest(root, lens)
-        known = ", ".join(dict.fromkeys(lens.words[0] for lens in self.lenses))
+        known = ", ".join(dict.fromkeys(lens.words[0] for lens in self.table))
         raise InputError(
             f"the model {'-'.join(stated)[:40]!r} of {self.program} is not known; {self.advice} one of "
             f"{known}, or calibrate with neurocal from the points"
@@ -133,7 +152,7 @@ class CameraKeys:
 
     def _fullest(self, root: Field, lens: Lens) -> Lens:
         """The lens of the same names with the most coefficients, if possible of those that are there."""
-        alike = [other for other in self.lenses if other.words == lens.words]
+        alike = [other for other in self.table if other.words == lens.words]
         there = [one for one in alike if all(path == NOTHING or find(root, path) for path in one.places)]
         return (there or alike)[-1]
 
@@ -147,8 +166,8 @@ class CameraKeys:
         else:
             fields = {path: find(root, path) for path in lens.places if path != NOTHING}
             stated = any(fields.values())
-            fewest = next(one for one in self.lenses if one.words == lens.words).places
-            needed = lens.places if whole else ()
+            fewest = next(one for one in self.table if one.words == lens.words).places
+            needed = lens.places if whole else []
             if stated and not whole:  # later coefficients alone are no distortion
                 all_of = self.optional == "all" or lens.ours == "fisheye"
                 needed = fewest if all_of else lens.places[:1]
@@ -180,28 +199,28 @@ class CameraKeys:
 
         If `every`, because a coefficient is missing, each number may be it.
         """
-        numbered = *self.intrinsics, *lens.intrinsics, *lens.places
-        others = *self.size, *self.constants, *split(self.model), self.name, self.skew, self.aspect
+        numbered = *listed(self.intrinsics), *lens.intrinsics, *lens.places
+        others = *listed(self.size), *self.constants, *split(self.model), self.name, self.skew, self.aspect
         paths = [path.partition(":")[0] for path in (*numbered, *others) if path]
-        different = [one for one in self.lenses if one.ours not in (lens.ours, "none")]
-        words = {_plain(word) for one in different for word in one.words if len(word) > 2}
+        different = [one for one in self.table if one.ours not in (lens.ours, "none")]
+        words = {plain(word) for one in different for word in one.words if len(word) > 2}
         above = (accumulate(path.split("/")[:-1], "{}/{}".format) for path in paths)
         for folder in dict.fromkeys(["", *chain.from_iterable(above)]):
             parent = find(root, folder) if folder else root
             start = f"{folder}/" if folder else ""
             known = {path.removeprefix(start).partition("/")[0] for path in paths if path.startswith(start)}
-            value, listed = None if parent is None else parent.value, False
+            value, in_list = None if parent is None else parent.value, False
             if isinstance(value, list) and any(path.startswith(start) for path in numbered):
-                value, listed = {str(k): entry for k, entry in enumerate(value)}, True
+                value, in_list = {str(k): entry for k, entry in enumerate(value)}, True
             for key, entry in value.items() if isinstance(value, dict) else ():
-                if key in known or key in self.aside:
+                if key in known or key in self.aside.split():
                     continue
                 if isinstance(entry, dict) and "val" in entry:
                     entry = entry["val"]
-                named = isinstance(entry, str) and _plain(entry) in words
-                if named or may_be_distortion(f"k{key}" if listed else key, entry, False, every):
+                named = isinstance(entry, str) and plain(entry) in words
+                if named or may_be_distortion(f"k{key}" if in_list else key, entry, False, every):
                     place = f"{parent.path}." if parent is not None and parent.path else ""
-                    what = f"coefficient {folder}[{key}]" if listed else f"key {place + key[:60]!r}"
+                    what = f"coefficient {folder}[{key}]" if in_list else f"key {place + key[:60]!r}"
                     raise InputError(
                         f"the {what} is not known in {self.program}'s {lens.words[0] or 'cameras'}, and may "
                         "tell their distortion; correct its name, remove it, or calibrate with neurocal from "
@@ -210,7 +229,7 @@ class CameraKeys:
 
     def tree(self, camera: Camera) -> dict[str, Any]:
         """The tree of a camera, whose model is one of `models`."""
-        fitting = (lens for lens in self.lenses if with_model(camera.distortion, lens.ours) is not None)
+        fitting = (lens for lens in self.table if with_model(camera.distortion, lens.ours) is not None)
         lens = next(fitting)
         distortion = with_model(camera.distortion, lens.ours)
         assert distortion is not None
@@ -226,8 +245,8 @@ class CameraKeys:
         if self.name:
             put(tree, self.name, camera.name)
         if self.size:
-            _put_all(tree, self.size, camera.image_size or (0, 0))
-        paths = lens.intrinsics or self.intrinsics
+            _put_all(tree, listed(self.size), camera.image_size or (0, 0))
+        paths = lens.intrinsics or listed(self.intrinsics)
         if ":" in paths[0] and not paths[0].endswith((":list", ":column")):
             put(tree, paths[0], matrix_of(a, b, u0, v0, skew))
         else:
@@ -251,19 +270,10 @@ def _ordinary(values: Array) -> Distortion:
     return Distortion(next(one for one in models if not values[len(MODELS[one]) :].any()), values)
 
 
-def _put_all(tree: dict[str, Any], paths: tuple[str, ...], values: Any) -> None:
+def _put_all(tree: dict[str, Any], paths: list[str], values: Any) -> None:
     if len(paths) == 1 < len(values):
         put(tree, paths[0], np.array(values) if ":" in paths[0] and "list" not in paths[0] else list(values))
     else:
         for path, value in zip(paths, values, strict=True):
             if path != NOTHING:
                 put(tree, path, value)
-
-
-def _plain(word: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", word.lower())
-
-
-K4 = ("k1", "k2", "k3", "k4")
-RADTAN = ("k1", "k2", "p1", "p2")
-FIVE, EIGHT = (*RADTAN, "k3"), (*RADTAN, "k3", "k4", "k5", "k6")

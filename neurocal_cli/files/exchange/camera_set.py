@@ -6,7 +6,7 @@ read-only arrays. A camera is adapted exactly, or approximately with the loss in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError, plural
 
 if TYPE_CHECKING:
-    from neurocal_cli.files.exchange.document import Document
+    from neurocal_cli.files.exchange.format_table import Format
 
 _FILM = float(np.hypot(36.0, 24.0))  # diagonal [mm]
 STILL = Pose(np.eye(3), np.zeros(3))
@@ -98,55 +98,6 @@ class CameraSet:
             poses={name: Pose(pose.R, scale * pose.t) for name, pose in self.poses.items()},
             unit="m",
         )
-
-
-def _not_written(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
-    raise InputError(f"files like that of {cameras.program} are not written; choose another format")
-
-
-def _not_read(document: Document) -> CameraSet:
-    raise InputError("files of this format are not read; give another")
-
-
-@frozen_dataclass
-class Format:
-    """A file format: what it is like, how it is recognised and read, and how cameras that fit it are written.
-
-    One without `text` is not written, one without `read` not read.
-    """
-
-    program: str  # name for messages
-    models: tuple[str, ...] = ()  # our names of its distortion models, the simplest first
-    # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
-    text: Callable[[CameraSet, str], Mapping[str, str | bytes]] = _not_written
-    matches: Callable[[Document], object] = lambda _: False
-    read: Callable[[Document], CameraSet] = _not_read
-    files: str = ""  # its files, for the documentation
-    skew: bool = False  # whether its programs support skew
-    poses: bool = False  # whether it contains the poses of views
-    most_cameras: int = 1
-    metres: bool = False  # whether lengths are in metres
-    needs_size: bool = False  # whether the image size must be known
-    rectified: bool = False  # whether it contains the rectification of a camera
-    square: bool = False  # whether its pixels are square
-    first_pixel: float = 0.0  # coordinate of the centre of the first pixel
-    marks: frozenset[str] = frozenset()  # the first keys of a camera's paths
-    rig: str = ""  # how the poses of several cameras are stated, for the documentation
-
-    @property
-    def to(self) -> str:
-        """The value of the option ``--to``."""
-        return {"NumPy": "npz"}.get(self.program, self.program.lower())
-
-    @property
-    def is_written(self) -> bool:
-        """Whether it is written."""
-        return self.text is not _not_written
-
-    @property
-    def is_read(self) -> bool:
-        """Whether it is read."""
-        return self.read is not _not_read
 
 
 def mounted(
@@ -243,9 +194,9 @@ def adapt_cameras(
     cannot represent the distortion model (unless `force` accepts the nearest one of another model), the
     number of cameras, or an unknown unit or image size.
     """
-    if len(cameras.cameras) > target.most_cameras:
+    if len(cameras.cameras) > target.most:
         raise InputError(
-            f"a file of {target.program} holds {plural(target.most_cameras, 'camera')} at most, and there "
+            f"a file of {target.program} holds {plural(target.most, 'camera')} at most, and there "
             f"are {len(cameras.cameras)}; write another format"
         )
     if target.needs_size and any(camera.image_size is None for camera in cameras.cameras):
@@ -302,12 +253,12 @@ def _adapted(
     models = target.models if wanted is None else (wanted,)
     lenses = (with_model(camera.distortion, model) for model in models)
     exact = next((lens for lens in lenses if lens is not None), None)
-    straight = target.skew or not camera.intrinsics.skewed
+    straight = target.holds_skew or not camera.intrinsics.skewed
     if exact is not None and straight:
         # The same object tells the caller that nothing changed.
         return camera if exact is camera.distortion else replace(camera, distortion=exact), None, ""
     if wanted is not None:
-        near = nearest_camera(camera, wanted, target.skew, points)
+        near = nearest_camera(camera, wanted, target.holds_skew, points)
         return near.camera, near, f"the nearest {wanted}{'' if straight else ' without skew'} {_pixels(near)}"
     if exact is not None:
         near = nearest_camera(camera, exact.model, False, points)
@@ -339,7 +290,7 @@ def _nearest(camera: Camera, target: Format, points: Array | None) -> list[Neare
     found = []
     for model in target.models:
         try:
-            found.append(nearest_camera(camera, model, target.skew, points))
+            found.append(nearest_camera(camera, model, target.holds_skew, points))
         except InputError:
             if model == target.models[-1] and not found:
                 raise

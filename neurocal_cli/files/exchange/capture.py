@@ -18,24 +18,14 @@ import numpy as np
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after
+from neurocal_cli.files.exchange.camera_set import CameraSet, after
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import toml_text
 from neurocal_cli.files.tree_fields import Field
 
+
 # anipose, freemocap and caliscope: TOML with a section for each camera, posed from the world to the camera.
-_CALISCOPE = CameraKeys(
-    "caliscope",
-    ("matrix:matrix",),
-    (Lens(("false",), "plumb_bob", ("distortions",)), Lens(("true",), "fisheye", ("distortions",))),
-    model="fisheye",
-    size=("size",),
-)
-_ANIPOSE = replace(_CALISCOPE, program="anipose", name="name")
-
-
 def _sections(document: Document) -> dict[str, Field]:
     """Sections of cameras, by name."""
     below = document.tree.get("cameras")
@@ -63,43 +53,45 @@ def _anipose_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-CALISCOPE = table(
-    _CALISCOPE,
-    lambda document: "cameras" in document.tree and _sections(document),
-    "camera_array.toml of caliscope",
+CALISCOPE = Format(
+    "caliscope",
+    "matrix:matrix",
+    """
+    false: plumb_bob distortions
+    true: fisheye distortions
+    """,
+    model="fisheye",
+    size="size",
+    told=lambda document: "cameras" in document.tree and _sections(document),
+    files="camera_array.toml of caliscope",
     parts=_anipose_parts,
-    pose=PoseKeys(("rotation", "translation"), frame="world"),
+    pose=PoseKeys("rotation translation", frame="world"),
     write=toml_text,
     whole=lambda trees, cameras: {
         f"cameras.{k}": {"cam_id": k, "rotation_count": 0, "ignore": False, **tree}
         for k, tree in enumerate(trees)
     },
-    skew=True,
-    most_cameras=99,
+    has_skew=True,
     metres=True,
     needs_size=True,
     rig="`rotation, translation` [m] from the world to each camera",
 )
-ANIPOSE = table(
-    _ANIPOSE,
-    _sections,
-    "calibration.toml of anipose, freemocap",
-    parts=_anipose_parts,
-    pose=PoseKeys(("rotation:vector", "translation"), frame="world"),
-    unit=None,
-    write=toml_text,
+ANIPOSE = replace(
+    CALISCOPE,
+    program="anipose",
+    name="name",
+    told=_sections,
+    files="calibration.toml of anipose, freemocap",
+    pose=PoseKeys("rotation:vector translation", frame="world"),
     whole=lambda trees, cameras: (
         {f"cam_{k}": tree for k, tree in enumerate(trees)} | {"metadata": {"adjusted": False}}
     ),
-    skew=True,
-    most_cameras=99,
-    needs_size=True,
+    metres=False,
     rig="`rotation, translation` from the world to each camera",
 )
 
+
 # EasyMocap: intri.yml with K and dist of each name, extri.yml with the poses, both from the world.
-
-
 def easymocap_names(document: Document) -> list[str]:
     """Names of the cameras of a file of EasyMocap; none if it is another."""
     names = document.tree.get("names")
@@ -118,14 +110,19 @@ def _easymocap_parts(document: Document) -> dict[str, Tree]:
     }
 
 
-_OF_EASYMOCAP = (Lens(("",), "plumb_bob", ("dist",)), Lens(("fisheye",), "fisheye", ("dist",)))
-EASYMOCAP = table(
-    CameraKeys("EasyMocap", ("K:data",), _OF_EASYMOCAP, model="model"),
-    easymocap_names,
-    "intri.yml and extri.yml",
+EASYMOCAP = Format(
+    "EasyMocap",
+    "K:data",
+    """
+    : plumb_bob dist
+    fisheye: fisheye dist
+    """,
+    model="model",
+    told=easymocap_names,
+    files="intri.yml and extri.yml",
     parts=_easymocap_parts,
-    pose=PoseKeys(("Rot", "T"), frame="world"),
-    most_cameras=99,
+    pose=PoseKeys("Rot T", frame="world"),
+    metres=True,
     rig="`Rot_`, `T_` from the world to each camera",
 )
 
@@ -168,5 +165,11 @@ def _dlt_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
 
 
 DLT = Format(
-    "DLT", ("none",), _dlt_text, files="11 rows, written only", skew=True, poses=True, most_cameras=99
+    "DLT",
+    lenses="none",
+    files="11 rows, written only",
+    texts=_dlt_text,
+    has_skew=True,
+    poses=True,
+    most_cameras=99,
 )

@@ -16,91 +16,49 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import FormatError, InputError, value_failures
-from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import (
-    STILL,
-    CameraSet,
-    Format,
-    after,
-    from_quaternion,
-    to_quaternion,
-)
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.files.exchange.camera_set import CameraSet, after, to_quaternion
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import only
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.reading import read_bytes, read_text
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.tree_fields import Field, is_number
 from neurocal_cli.files.yaml_text import number
 
 _Lines = list[tuple[int, list[str]]]  # of a file: number and words
 
-# COLMAP's number of the model, our model, number of focal lengths, and for each of our coefficients the index
-# of COLMAP's, or None for 0. The first that fits a camera is written.
-_MODELS: dict[str, tuple[int, str, int, tuple[int | None, ...]]] = {
-    "PINHOLE": (1, "none", 2, ()),
-    "OPENCV": (4, "k1k2p1p2", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "OPENCV_FISHEYE": (5, "fisheye", 2, (0, 1, 2, 3)),
-    "EUCM": (16, "eucm", 2, (0, 1)),  # since version 4
-    "SIMPLE_PINHOLE": (0, "none", 1, ()),
-    "SIMPLE_RADIAL": (2, "k1", 1, (0,)),
-    "RADIAL": (3, "k1k2", 1, (0, 1)),
-    "SIMPLE_RADIAL_FISHEYE": (8, "fisheye", 1, (0, None, None, None)),
-    "RADIAL_FISHEYE": (9, "fisheye", 1, (0, 1, None, None)),
-    "SIMPLE_FISHEYE": (14, "fisheye", 1, (None, None, None, None)),  # since version 4
-    "FISHEYE": (15, "fisheye", 2, (None, None, None, None)),  # since version 4
+# Lenses by their numbers in binary files. The first that fits a camera is written.
+_LENSES = {
+    1: "PINHOLE: none of params/0-3",
+    4: "OPENCV: k1k2p1p2 params/4-7 of params/0-3",
+    6: "FULL_OPENCV: rational params/4-11 of params/0-3",
+    5: "OPENCV_FISHEYE: fisheye params/4-7 of params/0-3",
+    16: "EUCM: eucm params/4-5 of params/0-3",  # since version 4
+    0: "SIMPLE_PINHOLE: none of params/0,0,1,2",
+    2: "SIMPLE_RADIAL: k1 params/3 of params/0,0,1,2",
+    3: "RADIAL: k1k2 params/3-4 of params/0,0,1,2",
+    8: "SIMPLE_RADIAL_FISHEYE: fisheye params/3 - - - of params/0,0,1,2",
+    9: "RADIAL_FISHEYE: fisheye params/3-4 - - of params/0,0,1,2",
+    14: "SIMPLE_FISHEYE: fisheye - - - - of params/0,0,1,2",  # since version 4
+    15: "FISHEYE: fisheye - - - - of params/0-3",  # since version 4
 }
 _OTHERS = {
     7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION",
     13: "DIVISION", 17: "EQUIRECTANGULAR",
 }  # fmt: skip
+_NAMES = {number: line.partition(":")[0] for number, line in _LENSES.items()}
+_COUNTS = {  # of parameters
+    _NAMES[number]: 1 + max(map(int, re.findall(r"\d+\b", line.partition(":")[2])))
+    for number, line in _LENSES.items()
+}
 _LINE = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
+_POSE = PoseKeys("q t", from_first=True)
 
 
-# A camera as pycolmap and hloc have it in a dictionary.
-_KEYS = CameraKeys(
-    "COLMAP",
-    (),
-    tuple(
-        Lens(
-            (name,),
-            ours,
-            tuple(NOTHING if k is None else f"params/{focal + 2 + k}" for k in places),
-            tuple(f"params/{k}" for k in (0, focal - 1, focal, focal + 1)),
-        )
-        for name, (_, ours, focal, places) in _MODELS.items()
-    ),
-    model="model",
-    size=("width", "height"),
-    first_pixel=0.5,
-)
-
-
-def _read_folder(folder: str) -> CameraSet:
-    """Read the cameras of a model with their relative poses and the poses of the images."""
-    lines, source = _file(folder, "cameras")
-    if lines is None:
-        raise FormatError(
-            "is a folder without COLMAP's cameras.txt or cameras.bin; give a camera file, or the two of a "
-            "rig",
-            folder,
-        )
-    with value_failures(source):
-        cameras = _cameras(lines, source)
-        relative = _rig(folder, list(cameras))
-        found = CameraSet(tuple(cameras.values()), relative, program="COLMAP")
-        return replace(found, poses=_poses(folder, next(iter(cameras))))
-
-
-def is_cameras(document: Document) -> bool:
+def _is_cameras(document: Document) -> bool:
     """Whether this is a folder, ``cameras.txt``, ``cameras.bin`` or a dictionary of a camera."""
     data = document.data
-    if document.is_folder or _stated_model(document) is not None or _sensors(document) is not None:
+    if document.is_folder or _stated_model(document) is not None:
         return True
     if len(data) < 48 or document.is_text:
         return bool(_LINE(document.text))
@@ -112,34 +70,30 @@ def _stated_model(document: Document) -> str | None:
     """The model of a dictionary of a camera, as pycolmap and hloc have it; None for other files."""
     tree = document.tree
     name = str(tree.get("model", tree.get("camera_model", ""))).rpartition(".")[2]
-    known = name in _MODELS or name in _OTHERS.values()
+    known = name in _COUNTS or name in _OTHERS.values()
     return name if known and {"params", "width", "height"} <= set(tree) else None
 
 
-def _sensors(document: Document) -> dict[str, Camera] | None:
-    """The cameras of a file of kapture, whose models are those of COLMAP; None for other files."""
-    if not document.text.startswith("# kapture format"):
-        return None
-    rows = [[word.strip() for word in line.split(",")] for line in document.text.splitlines()]
-    return {
-        row[0]: _camera(["1", *row[3:]], document.source, k)
-        for k, row in enumerate(rows, start=1)
-        if row[2:3] == ["camera"]
-    }
-
-
-def read_file(document: Document) -> CameraSet:
-    """Read a model, or ``cameras.txt`` or ``cameras.bin`` with one camera."""
+def _parts(document: Document) -> dict[str, Field]:
+    """The cameras of a model, or of ``cameras.txt`` or ``cameras.bin``, and perhaps their poses."""
     source = document.source
-    if document.is_folder:
-        return _read_folder(source)
     if (stated := _stated_model(document)) is not None:
-        camera = Field({**document.tree, "model": stated}, source)
-        return CameraSet((_KEYS.camera(camera, "camera1"),), program="COLMAP")
-    if (sensors := _sensors(document)) is not None:
-        return only(list(sensors.values()), sensors, "kapture")
-    lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
-    return CameraSet(tuple(_cameras(lines, source).values()), program="COLMAP")
+        return {"camera1": Field({**document.tree, "model": stated}, source)}
+    if not document.is_folder:
+        lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
+        return {f"camera{one}": tree for one, tree in _cameras(lines, source).items()}
+    read, source = _file(source, "cameras")
+    if read is None:
+        raise FormatError(
+            "is a folder without COLMAP's cameras.txt or cameras.bin; give a camera file, or the two of a "
+            "rig",
+            source,
+        )
+    cameras = _cameras(read, source)
+    _add_rig(document.source, cameras)
+    first = next(iter(cameras))
+    cameras[first].value["views"] = _views_of(document.source, first)
+    return {f"camera{one}": tree for one, tree in cameras.items()}
 
 
 def _file(folder: str, name: str) -> tuple[_Lines | None, str]:
@@ -173,15 +127,14 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
         return values
 
     def cameras() -> Iterator[object]:
-        names = {number: model for model, (number, *_) in _MODELS.items()}
         one, model, width, height = take("iiQQ")
-        if model not in names:
+        if model not in _NAMES:
             other = _OTHERS.get(model, f"number {model}")
             raise FormatError(
-                f"the camera model {other} is not known; use one of {', '.join(names.values())}", source
+                f"the camera model {other} is not known; use one of {', '.join(_COUNTS)}", source
             )
-        yield from (one, names[model], width, height)
-        yield from take(f"{_count(names[model])}d")
+        yield from (one, _NAMES[model], width, height)
+        yield from take(f"{_COUNTS[_NAMES[model]]}d")
 
     def images() -> Iterator[object]:
         nonlocal place
@@ -218,7 +171,7 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
     return rows
 
 
-def _cameras(lines: _Lines, source: str) -> dict[int, Camera]:
+def _cameras(lines: _Lines, source: str) -> dict[int, Field]:
     cameras = {}
     for k, words in lines:
         if not words[0].isdecimal():
@@ -227,69 +180,75 @@ def _cameras(lines: _Lines, source: str) -> dict[int, Camera]:
     return cameras
 
 
-def _camera(words: list[str], source: str, line: int) -> Camera:
-    model = words[1] if len(words) > 1 else ""
-    if model not in _MODELS:
-        known = ", ".join(_MODELS)
+def _camera(words: list[str], source: str, line: int) -> Field:
+    model, size, values = words[1] if len(words) > 1 else "", words[2:4], words[4:]
+    if model not in _COUNTS:
+        known = ", ".join(_COUNTS)
         raise FormatError(f"the camera model {model[:40]!r} is not known; use one of {known}", source, line)
-    try:
-        values = [float(word) for word in words[4:]]
-        if len(values) != _count(model) or not np.isfinite(values).all():
-            raise ValueError
-        tree = {"model": model, "width": int(words[2]), "height": int(words[3]), "params": values}
-    except (ValueError, IndexError) as error:
-        raise FormatError(
-            f"is not the line of a camera with the model {model}; correct it", source, line
-        ) from error
-    return _KEYS.camera(Field(tree, source), f"camera{words[0]}")
+    if len(values) != _COUNTS[model] or not all(map(is_number, values)) or not all(map(str.isdecimal, size)):
+        raise FormatError(f"is not the line of a camera with the model {model}; correct it", source, line)
+    tree = {"model": model, "width": int(size[0]), "height": int(size[1])}
+    return Field({**tree, "params": list(map(float, values))}, source)
 
 
-def _count(model: str) -> int:
-    """Number of the parameters of a model."""
-    _, _, focal, places = _MODELS[model]
-    return focal + 2 + len([k for k in places if k is not None])
-
-
-def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
-    """Poses of the further cameras relative to the first one."""
+def _add_rig(folder: str, cameras: dict[int, Field]) -> None:
+    """Add the poses of the further cameras relative to the first one."""
     rows, source = _file(folder, "rigs")
-    if len(ids) == 1 or rows is None:
-        return ()
+    if len(cameras) == 1 or rows is None:
+        return
     if len(rows) != 1:
         raise FormatError("holds several rigs; give a model with one", source)
     line, words = rows[0]
     try:
-        poses, rest = {int(words[3]): STILL}, words[4:]
+        poses: dict[int, Tree] = {int(words[3]): {}}
+        rest = words[4:]
         while rest:
             if rest[0] != "CAMERA" or rest[2] != "1":
                 raise FormatError("a sensor is no camera, or has no pose", source, line)
-            poses[int(rest[1])] = _pose(np.array(rest[3:10], dtype=float))
+            poses[int(rest[1])] = _seven_of(rest[3:10])
             rest = rest[10:]
-        first = poses[ids[0]]
-        if np.abs(first.D - np.eye(3, 4)).max() > 0:
-            raise FormatError(f"the reference of the rig must be the camera {ids[0]}", source, line)
-        return tuple(poses[camera] for camera in ids[1:])
+        first = next(iter(cameras))
+        if poses[first]:
+            raise FormatError(f"the reference of the rig must be the camera {first}", source, line)
+        for one, camera in cameras.items():
+            camera.value.update(poses[one])
     except (ValueError, IndexError, KeyError) as error:
         if isinstance(error, FormatError):
             raise
         raise FormatError("is not the line of a rig of these cameras; correct it", source, line) from error
 
 
-def _poses(folder: str, camera: int) -> dict[str, Pose]:
+def _views_of(folder: str, camera: int) -> Tree:
     """Poses of the images of one camera."""
     rows, source = _file(folder, "images")
     poses = {}
     for k, words in rows or ():
         try:
             if int(words[8]) == camera:
-                poses[words[9].strip()] = _pose(np.array(words[1:8], dtype=float))
+                poses[words[9].strip()] = _seven_of(words[1:8])
         except (ValueError, IndexError) as error:
             raise FormatError("is not the line of an image; correct it", source, k) from error
     return poses
 
 
-def _pose(values: Array) -> Pose:
-    return Pose(from_quaternion(values[:4]), values[4:])
+def _seven_of(words: list[str]) -> Tree:
+    numbers = list(map(float, words))
+    return {"q": numbers[:4], "t": numbers[4:]}
+
+
+def _views(root: Field) -> dict[str, Pose]:
+    found = {name: _POSE.read(part) for name, part in root.get("views", {}).entries().items()}
+    return {name: pose for name, pose in found.items() if pose is not None}
+
+
+# Sensors of kapture, whose models are those of COLMAP.
+def _kapture_parts(document: Document) -> dict[str, Field]:
+    rows = [[word.strip() for word in line.split(",")] for line in document.text.splitlines()]
+    return {
+        row[0]: _camera(["1", *row[3:]], document.source, k)
+        for k, row in enumerate(rows, start=1)
+        if row[2:3] == ["camera"]
+    }
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
@@ -298,7 +257,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
     ]
     for k, camera in enumerate(cameras.cameras, start=1):
-        tree = _KEYS.tree(camera)
+        tree = FORMAT.tree(camera)
         words = tree["model"], tree["width"], tree["height"], *map(number, tree["params"])
         lines.append(f"{k} {' '.join(map(str, words))}")
     if len(cameras.cameras) == 1 and not cameras.poses:
@@ -335,16 +294,30 @@ def _seven(pose: Pose) -> str:
     return " ".join(map(number, [*to_quaternion(pose.R), *pose.t]))
 
 
-FORMAT = Format(
-    "COLMAP",
-    _KEYS.models,
-    _text,
-    is_cameras,
-    read_file,
+KAPTURE = Format(
+    "kapture",
+    lenses="\n".join(_LENSES.values()),
+    model="model",
+    size="width,height",
+    first_pixel=0.5,
+    told=lambda document: document.text.startswith("# kapture format"),
+    files="sensors.txt, with the models of COLMAP",
+    parts=_kapture_parts,
+    project=True,
+    likely=False,
+)
+FORMAT = replace(
+    KAPTURE,
+    program="COLMAP",
+    told=_is_cameras,
     files="cameras.txt or cameras.bin, with the rest of a model; dictionary of a camera",
+    parts=_parts,
+    pose=_POSE,
+    views=_views,
+    project=False,
+    texts=_text,
     poses=True,
     most_cameras=99,
     needs_size=True,
-    first_pixel=0.5,
     rig="`rigs.txt`, from the first camera",
 )

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import NOTHING, CameraKeys, Lens
 from neurocal_cli.files.exchange.document import Document, assignments
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
-from neurocal_cli.files.exchange.tree_paths import in_order, under
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.tree_paths import in_order, in_rows
 from neurocal_cli.files.tree_fields import Field, is_number
 
-# One name of a lens, whose coefficients are OpenCV's; and none.
-_ORDINARY, _NONE = Lens(("",), "plumb_bob", ("D",)), Lens(("",), "none", ())
 
 # KITTI: cameras of the recording, each posed relative to the first, and rectified ones of the odometry, whose
 # P is K [I | t].
-_KITTI = CameraKeys("KITTI", ("K:matrix",), (_ORDINARY,), size=("S",))
-
-
-def _kitti_lines(text: str) -> dict[str, list[float]]:
-    pairs = (line.partition(":") for line in text.splitlines())
-    lines = {key.strip(): rest.split() for key, _, rest in pairs}
-    numbers = {key: words for key, words in lines.items() if all(map(is_number, words))}  # no calib_time
-    return {key: [float(word) for word in words] for key, words in numbers.items()}
-
-
 def _kitti_parts(document: Document) -> dict[str, Tree]:
-    lines = _kitti_lines(document.text)
+    pairs = (line.partition(":") for line in document.text.splitlines())
+    lines = {
+        key.strip(): [float(word) for word in rest.split()]
+        for key, _, rest in pairs
+        if all(map(is_number, rest.split()))  # no calib_time
+    }
     ids = sorted(key[2:] for key in lines if key.startswith("K_"))
     if ids:
         return {f"image_{k}": {key: lines.get(f"{key}_{k}", []) for key in "SKDRT"} for k in ids}
@@ -42,27 +33,21 @@ def _kitti_parts(document: Document) -> dict[str, Tree]:
     return parts
 
 
-KITTI = table(
-    _KITTI,
-    lambda document: "\nK_0" in document.text[:20_000] or document.text.startswith("P0:"),
-    "calib_cam_to_cam.txt; calib.txt of the odometry",
+KITTI = Format(
+    "KITTI",
+    "K:matrix",
+    "plumb_bob D",
+    size="S",
+    told=lambda document: "\nK_0" in document.text[:20_000] or document.text.startswith("P0:"),
+    files="calib_cam_to_cam.txt; calib.txt of the odometry",
     parts=_kitti_parts,
-    pose=PoseKeys(("R", "T")),
-    most_cameras=99,
+    pose=PoseKeys("R T"),
     metres=True,
     rig="`R_`, `T_` from camera 0; `P0` to `P3`",
 )
 
+
 # Argoverse 1: poses of the cameras in the vehicle, quaternions w, x, y, z, and k1, k2, k3 of the lens.
-_RADIAL = under("distortion_coefficients_/", "0", "1", "2")
-_ARGOVERSE = CameraKeys(
-    "Argoverse",
-    under("focal_", "length_x_px_", "length_y_px_", "center_x_px_", "center_y_px_"),
-    (Lens(("",), "plumb_bob", (*_RADIAL[:2], NOTHING, NOTHING, _RADIAL[2])),),
-    skew="skew_",
-)
-
-
 def _argoverse_parts(document: Document) -> dict[str, Field]:
     parts = {
         entry["key"].text().removeprefix("image_raw_"): entry["value"]
@@ -75,65 +60,65 @@ def _argoverse_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-ARGOVERSE = table(
-    _ARGOVERSE,
-    "camera_data_",
-    "vehicle_calibration_info.json of Argoverse 1",
+_IN_VEHICLE = "vehicle_SE3_camera_/rotation/coefficients vehicle_SE3_camera_/translation"
+ARGOVERSE = Format(
+    "Argoverse",
+    "focal_length_x_px_,focal_length_y_px_,focal_center_x_px_,focal_center_y_px_",
+    "plumb_bob distortion_coefficients_/0-1 - - distortion_coefficients_/2",
+    skew="skew_",
+    told="camera_data_",
+    files="vehicle_calibration_info.json of Argoverse 1",
     parts=_argoverse_parts,
-    pose=PoseKeys(
-        ("vehicle_SE3_camera_/rotation/coefficients", "vehicle_SE3_camera_/translation"),
-        back=True,
-        needed=True,
-    ),
-    most_cameras=99,
+    pose=PoseKeys(_IN_VEHICLE, back=True, needed=True),
+    metres=True,
     rig="`vehicle_SE3_camera_` from each camera to the vehicle",
 )
 
 # The Zenseact Open Dataset: the camera of a car as its own programs project it, a fisheye.
-ZOD = table(
-    CameraKeys(
-        "ZOD",
-        under("intrinsics/", "0/0", "1/1", "0/2", "1/2"),
-        (Lens(("",), "fisheye", ("distortion",)),),
-        size=("image_dimensions",),
-    ),
-    lambda document: "undistortion" in (document.tree.get("FC") or ()),
-    "calibration.json of the Zenseact Open Dataset",
+ZOD = Format(
+    "ZOD",
+    "intrinsics/0/0 intrinsics/1/1 intrinsics/0/2 intrinsics/1/2",
+    "fisheye distortion",
+    size="image_dimensions",
+    told=lambda document: "undistortion" in (document.tree.get("FC") or ()),
+    files="calibration.json of the Zenseact Open Dataset",
     parts=lambda document: {"FC": document.root["FC"]},
-    pose=PoseKeys(("extrinsics",), back=True, frame="vehicle"),
+    pose=PoseKeys("extrinsics", back=True, frame="vehicle"),
+    metres=True,
 )
 
 
 # nuScenes: rectified cameras among the sensors of a car, quaternions w, x, y, z.
-_NUSCENES = ("camera_intrinsic", "rotation", "translation")
-
-
 def _nuscenes_parts(document: Document) -> dict[str, Field]:
     parts: dict[str, Field] = {}
     for entry in document.root.items():
         if not entry["camera_intrinsic"].value:
             continue  # another sensor
         name = entry["sensor_token"].text()
-        numbers = [[one[key].value for key in _NUSCENES] for one in (entry, parts.get(name, entry))]
+        numbers = [
+            [one[key].value for key in ("camera_intrinsic", "rotation", "translation")]
+            for one in (entry, parts.get(name, entry))
+        ]
         if numbers[0] != numbers[1]:
             raise InputError("holds several calibrations of a camera; save the sensors of one recording")
         parts[name] = entry
     return parts
 
 
-NUSCENES = table(
-    CameraKeys("nuScenes", _NUSCENES[:1], (_NONE,)),
-    lambda document: re.match(r'\s*\[\s*\{[^}]*"sensor_token"', document.text[:5000]),
-    "calibrated_sensor.json of nuScenes, with the sensors of one recording",
+NUSCENES = Format(
+    "nuScenes",
+    "camera_intrinsic",
+    "none",
+    told=lambda document: re.match(r'\s*\[\s*\{[^}]*"sensor_token"', document.text[:5000]),
+    files="calibrated_sensor.json of nuScenes, with the sensors of one recording",
     parts=_nuscenes_parts,
-    pose=PoseKeys(_NUSCENES[1:], back=True, needed=True, frame="vehicle"),
-    most_cameras=99,
+    pose=PoseKeys("rotation translation", back=True, needed=True, frame="vehicle"),
+    metres=True,
     rig="`rotation, translation` from each camera to the vehicle",
 )
 
+
 # Middlebury and ETH3D: a rectified pair, whose second camera is at (baseline, 0, 0) of the first.
-
-
 def _middlebury_parts(document: Document) -> dict[str, Tree]:
     stated = assignments(document.text)
     root = Field({name: value.tolist() for name, value in stated.items()}, document.source)
@@ -142,13 +127,15 @@ def _middlebury_parts(document: Document) -> dict[str, Tree]:
     return {name: {"K": root[name].value, **common} for name in ("cam0", "cam1")}
 
 
-MIDDLEBURY = table(
-    CameraKeys("Middlebury", ("K",), (_NONE,), size=("size",)),
-    lambda document: re.search(r"^\s*cam0\s*=\s*\[", document.text[:2000], re.MULTILINE),
-    "calib.txt of Middlebury and ETH3D",
+MIDDLEBURY = Format(
+    "Middlebury",
+    "K",
+    "none",
+    size="size",
+    told=lambda document: re.search(r"^\s*cam0\s*=\s*\[", document.text[:2000], re.MULTILINE),
+    files="calib.txt of Middlebury and ETH3D",
     parts=_middlebury_parts,
-    pose=PoseKeys(("R", "t"), from_first=True),
-    unit=None,
+    pose=PoseKeys("R t", from_first=True),
     rig="`baseline` along the rows",
 )
 
@@ -156,62 +143,65 @@ MIDDLEBURY = table(
 _MVSNET = re.compile(r"\A\s*extrinsic\s+((?:\S+\s+){16})intrinsic\s+((?:\S+\s+){9})").match
 
 
-def _mvsnet_parts(document: Document) -> Mapping[str, Field]:
+def _mvsnet_parts(document: Document) -> dict[str, Field]:
     found = _MVSNET(document.text)
-    assert found is not None  # `matches`
+    assert found is not None  # `told`
     words = (found[1] + found[2]).split()
     return {"camera": in_order("extrinsic:16 intrinsic:9", words, document.source)}
 
 
-MVSNET = table(
-    CameraKeys("MVSNet", ("intrinsic",), (_NONE,)),
-    lambda document: _MVSNET(document.text[:5000]),
-    "cam.txt of MVSNet, BlendedMVS",
+MVSNET = Format(
+    "MVSNet",
+    "intrinsic",
+    "none",
+    told=lambda document: _MVSNET(document.text[:5000]),
+    files="cam.txt of MVSNet, BlendedMVS",
     parts=_mvsnet_parts,
-    pose=PoseKeys(("extrinsic",), frame="world"),
-    unit=None,
+    pose=PoseKeys("extrinsic", frame="world"),
 )
 
 
-def _krtd_rows(document: Document) -> list[list[str]]:
-    """Rows of K, R, t and D; none if the file is another."""
-    rows = [line.split() for line in document.text[:5000].splitlines() if line.strip()]
-    counts = [len(row) for row in rows]
-    numbers = all(is_number(word) for row in rows for word in row)
-    plain = numbers and counts[:7] == [3] * 7 and len(rows) == 8 and counts[7] in (1, 4, 5, 8)
-    return rows if plain and rows[2] in (["0", "0", "1"], ["0.0", "0.0", "1.0"]) else []
+def _krtd(document: Document) -> dict[str, Field]:
+    found = in_rows("K:9/3,R:9/3,t:3,D:", document.text, document.source)
+    if found is None or found.value["K"][6:] != [0, 0, 1] or len(found.value["D"]) not in (1, 4, 5, 8):
+        return {}
+    return {"camera": found}
 
 
 def _krtd_parts(document: Document) -> dict[str, Field]:
-    rows = _krtd_rows(document)
-    if len(rows[7]) == 4:
+    if len(_krtd(document)["camera"].value["D"]) == 4:
         raise InputError("its four distortion coefficients may be k1, k2, p1, p2 or a fisheye's; write five")
-    return {"camera": in_order("K:9 R:9 t:3 D:", [word for row in rows for word in row], document.source)}
+    return _krtd(document)
 
 
-KRTD = table(
-    CameraKeys("KWIVER", ("K",), (_ORDINARY, Lens(("",), "rational", ("D",)))),
-    _krtd_rows,
-    ".krtd of KWIVER",
+KRTD = Format(
+    "KWIVER",
+    "K",
+    """
+    plumb_bob D
+    rational D
+    """,
+    told=_krtd,
+    files=".krtd of KWIVER",
     parts=_krtd_parts,
-    pose=PoseKeys(("R", "t"), frame="world"),
-    unit=None,
+    pose=PoseKeys("R t", frame="world"),
 )
 
+
 # DROID-SLAM and DPVO: one line of fx, fy, cx, cy and perhaps OpenCV's coefficients.
+def _droid(document: Document) -> dict[str, Field]:
+    found = in_rows("fx fy cx cy D:", document.text, document.source)
+    fx, fy, cx, cy, k = (0.0, 1.0, 0.0, 0.0, []) if found is None else found.value.values()
+    if found is None or len(k) not in (0, 4, 5) or min(fx, fy, cx, cy) <= 1 or not 0.2 < fx / fy < 5:
+        return {}
+    return {"camera": found}
 
 
-def _one_line(document: Document) -> list[str]:
-    words = document.text[:1000].split()
-    if document.text[:1000].strip().count("\n") or not all(map(is_number, words)):
-        return []
-    fx, fy, cx, cy = map(float, words[:4]) if len(words) in (4, 8, 9) else (0.0, 1.0, 0.0, 0.0)
-    return words if min(fx, fy, cx, cy) > 1 and 0.2 < fx / fy < 5 else []
-
-
-DROID = table(
-    CameraKeys("DROID-SLAM", ("fx", "fy", "cx", "cy"), (_ORDINARY,)),
-    _one_line,
-    "fx fy cx cy k1 k2 p1 p2 k3",
-    parts=lambda document: {"camera": in_order("fx fy cx cy D:", _one_line(document), document.source)},
+DROID = Format(
+    "DROID-SLAM",
+    "fx,fy,cx,cy",
+    "plumb_bob D",
+    told=_droid,
+    files="fx fy cx cy k1 k2 p1 p2 k3",
+    parts=_droid,
 )

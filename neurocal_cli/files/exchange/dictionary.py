@@ -27,57 +27,24 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, is_matrix, plain, plain_lists
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
+from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
-from neurocal_cli.files.exchange.format_table import PoseKeys, table
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
-from neurocal_cli.files.exchange.tree_paths import arrays, under
+from neurocal_cli.files.exchange.tree_paths import arrays
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import nested
 
 _K = "distortion_coefficients"
-_WRITTEN = (
-    Lens(("plumb_bob",), "plumb_bob", (_K,)),
-    Lens(("rational_polynomial", "rational"), "rational", (_K,)),
-    Lens(("thin_prism",), "thin_prism", (_K,)),
-    Lens(("tilted",), "tilted", (_K,)),
-    Lens(("equidistant", "fisheye"), "fisheye", (_K,)),
-    Lens(("omnidir",), "omnidir", ("xi", *under(f"{_K}/", *"0123"))),
-)
-_READ = (
-    Lens(("none",), "none", ()),
-    *(Lens((ours,), ours, (_K,)) for ours in ("k1k2", "k1k2p1p2", "double_sphere", "eucm", "rich")),
-    Lens(("k1",), "k1", (f"{_K}/0",)),
-)
-KEYS = CameraKeys(
-    "OpenCV",
-    ("camera_matrix:matrix",),
-    (*_WRITTEN, *_READ),
-    model="distortion_model",
-    size=("image_width", "image_height"),
-    name="camera_name",
-)
-MODELS = replace(KEYS, lenses=_WRITTEN).models
 _OF_TWO = {"camera_matrix": "M", _K: "D"}  # the other keys of two cameras are those of one
-_PLACED = PoseKeys(("R", "T"))  # from the first camera
+_PLACED = PoseKeys("R T")  # from the first camera
+_SIZE = ("image_width", "image_height")
 _ROWS, _VECTORS, _VIEWS, _UNIT = "extrinsic_parameters", ("rvecs", "tvecs"), "view_names", "unit"
 
 # Several cameras, of which each has its part of each array.
-_MULTIVIEW = CameraKeys(
-    "OpenCV",
-    ("Ks:matrix",),
-    (
-        *(Lens(("0",), ours, ("distortions",)) for ours in ("plumb_bob", "rational", "thin_prism", "tilted")),
-        Lens(("1",), "fisheye", ("distortions",)),
-    ),
-    model="is_fisheye",
-    size=("image_sizes",),
-    name="cam_ids",
-)
-_FROM_FIRST = PoseKeys(("rvecs:vector", "Ts"), needed=True)
+_FROM_FIRST = PoseKeys("rvecs:vector Ts", needed=True)
 _ARRAYS = ("Ks", "distortions", "rvecs", "Ts", "is_fisheye", "image_sizes")  # the last two may be missing
 _FEWEST = 5
 
@@ -86,7 +53,7 @@ def _multiview_tree(cameras: CameraSet) -> dict[str, Any]:
     """The dictionary of three cameras or more: texts and matrices."""
     if any(camera.distortion.model == "omnidir" for camera in cameras.cameras):
         raise InputError("OpenCV's file of several cameras has no omnidirectional ones; write another format")
-    trees = [_MULTIVIEW.tree(camera) for camera in cameras.cameras]
+    trees = [MULTIVIEW.tree(camera) for camera in cameras.cameras]
     width = max(_FEWEST, *(len(tree["distortions"]) for tree in trees))
     for tree, pose in zip(trees, cameras.mounted, strict=True):
         _FROM_FIRST.put(tree, pose)
@@ -132,11 +99,11 @@ def entries(cameras: CameraSet) -> dict[str, Any]:
     sides = ("",) if len(cameras.cameras) == 1 else ("1", "2")
     same = len({camera.image_size for camera in cameras.cameras}) == 1
     for side, camera in zip(sides, cameras.cameras, strict=True):
-        own = arrays(KEYS.tree(camera))
+        own = arrays(OPENCV.tree(camera))
         for key in NAMES:
-            if key not in own or (key in KEYS.size and camera.image_size is None):
+            if key not in own or (key in _SIZE and camera.image_size is None):
                 continue
-            end = "" if key in KEYS.size and same else side
+            end = "" if key in _SIZE and same else side
             tree[f"{_OF_TWO.get(key, key) if side else key}{end}"] = own[key]
     if cameras.has_lengths and cameras.unit is not None:
         tree[_UNIT] = cameras.unit
@@ -426,45 +393,73 @@ def _unit(root: Field) -> str | None:
     return root.read(_UNIT, Field.text)
 
 
-MULTIVIEW = table(
-    _MULTIVIEW,
-    " ".join(_ARRAYS[:4]),
-    "cv2.FileStorage of several cameras, as its multi-view sample writes it",
+MULTIVIEW = Format(
+    "OpenCV",
+    "Ks:matrix",
+    """
+    0: plumb_bob distortions
+    0: rational distortions
+    0: thin_prism distortions
+    0: tilted distortions
+    1: fisheye distortions
+    """,
+    model="is_fisheye",
+    size="image_sizes",
+    name="cam_ids",
+    told=" ".join(_ARRAYS[:4]),
+    files="cv2.FileStorage of several cameras, as its multi-view sample writes it",
     parts=_multiview_parts,
     pose=_FROM_FIRST,
     unit=_unit,
     finish=with_sizes_noted,
-    marks=frozenset(),
-    most_cameras=99,
+    likely=False,
     rig="`rvecs, Ts`: `X_k = R X_0 + T`",
 )
-OPENCV = table(
-    KEYS,
-    lambda document: document.tree or isinstance(document.root.value, list),
-    "cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
+OPENCV = Format(
+    "OpenCV",
+    "camera_matrix:matrix",
+    """
+    plumb_bob: plumb_bob distortion_coefficients
+    rational_polynomial, rational: rational distortion_coefficients
+    thin_prism: thin_prism distortion_coefficients
+    tilted: tilted distortion_coefficients
+    equidistant, fisheye: fisheye distortion_coefficients
+    omnidir: omnidir xi distortion_coefficients/0-3
+    none: none
+    k1k2: k1k2 distortion_coefficients
+    k1k2p1p2: k1k2p1p2 distortion_coefficients
+    double_sphere: double_sphere distortion_coefficients
+    eucm: eucm distortion_coefficients
+    rich: rich distortion_coefficients
+    k1: k1 distortion_coefficients/0
+    """,
+    model="distortion_model",
+    size="image_width,image_height",
+    name="camera_name",
+    told=lambda document: document.tree or isinstance(document.root.value, list),
+    files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
     parts=_parts,
     pose=_PLACED,
     unit=_unit,
     views=_views,
     finish=with_sizes_noted,
-    text=_opencv_text,
-    models=MODELS,
-    marks=frozenset(),
+    texts=_opencv_text,
+    written=("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir"),
+    likely=False,
     poses=True,
-    most_cameras=99,
     rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
 )
 JSON = replace(
     OPENCV,
     program="JSON",
-    read=Format.read,
-    text=lambda cameras, _: {"": json_text(entries(cameras))},
+    told="",
+    texts=lambda cameras, _: {"": json_text(entries(cameras))},
     files="dictionary of the same names",
-    skew=True,
+    has_skew=True,
 )
 NPZ = replace(
     JSON,
     program="NumPy",
-    text=lambda cameras, _: {"": npz_bytes(entries(cameras))},
+    texts=lambda cameras, _: {"": npz_bytes(entries(cameras))},
     files=".npz; .npy of the matrix, and of the coefficients",
 )

@@ -1,18 +1,19 @@
 """Formats as tables: the keys of a camera, those of its pose, where the cameras are, and what is not held.
 
-A format is added in the module of its relatives by one `table`, before those that are less specific:
+A format is added in the module of its relatives by one `Format`, before those that are less specific:
 
-    SPOT = table(
-        CameraKeys(
-            "Spot",  # the program
-            ("fx", "fy", "cx", "cy"),
-            (Lens(("brown",), "plumb_bob", FIVE), Lens(("kb4",), "fisheye", K4)),
-            model="lens",
-            size=("width", "height"),
-        ),
-        "lens fx",  # keys by which a file is told
-        "calibration of Spot, JSON",
-        pose=PoseKeys(("camera_to_body",), back=True),
+    SPOT = Format(
+        "Spot",  # the program
+        "fx,fy,cx,cy",
+        '''
+        brown: plumb_bob *
+        kb4: fisheye *
+        ''',
+        model="lens",
+        size="width,height",
+        told="lens fx",
+        files="calibration of Spot, JSON",
+        pose=PoseKeys("camera_to_body", back=True),
         write=json_text,
     )
 
@@ -23,12 +24,11 @@ a file says in other words, such as a principal point from the middle of the ima
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
-from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
@@ -36,7 +36,6 @@ from neurocal_cli.files.exchange.camera_keys import CameraKeys
 from neurocal_cli.files.exchange.camera_set import (
     STILL,
     CameraSet,
-    Format,
     from_quaternion,
     from_vector,
     inverse,
@@ -48,8 +47,8 @@ from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.tree_paths import at, find, numbers_at, put, split
 from neurocal_cli.files.tree_fields import Field
 
-Parts = Callable[[Document], Mapping[str, Any]]  # the tree of each camera of a file, by its name
 Tree = dict[str, Any]
+Parts = Mapping[str, Field]  # the tree of each camera of a file, by its name
 _SIZES = (3, 4, 9), (3,)  # numbers of a rotation and a translation
 
 
@@ -62,12 +61,17 @@ class PoseKeys:
     written, ``:vector`` or ``:quaternion`` names a form that is no matrix.
     """
 
-    paths: tuple[str, ...]
+    keys: str
     back: bool = False  # whether the pose maps from the camera
     centre: bool = False  # whether the translation is the place of the camera, of a rotation into the camera
     needed: bool = False  # whether a file without the pose is refused
     from_first: bool = False  # whether the frame is the first camera, which has no pose
     frame: str = "body"  # the pose of a single camera is its view of this name
+
+    @property
+    def paths(self) -> list[str]:
+        """The path of the pose, or those of the rotation and of the translation."""
+        return self.keys.split()
 
     def read(self, root: Field) -> Pose | None:
         """The pose; None if no part of it is there, or if all of its quaternion is 0."""
@@ -78,7 +82,7 @@ class PoseKeys:
             values = [values[0][:3], values[0][3:]]
         elif len(values) == 1:
             if len(values[0]) not in (12, 16):
-                at(root, self.paths[0]).fail("4 x 4 numbers")
+                at(root, self.keys).fail("4 x 4 numbers")
             T = values[0].reshape(-1, 4)
             values = [T[:3, :3].ravel(), T[:3, 3]]
         for path, entries, sizes in zip((self.paths[0], self.paths[-1]), values, _SIZES, strict=True):
@@ -101,124 +105,148 @@ class PoseKeys:
             for path, values in zip(self.paths, (rotation, pose.t), strict=True):
                 put(tree, path, values if "," not in path else values.tolist())
         elif form is None:
-            put(tree, self.paths[0], np.vstack([pose.D, [0.0, 0.0, 0.0, 1.0]]))
+            put(tree, self.keys, np.vstack([pose.D, [0.0, 0.0, 0.0, 1.0]]))
         else:
-            put(tree, self.paths[0], np.concatenate([rotation, pose.t]))
+            put(tree, self.keys, np.concatenate([rotation, pose.t]))
 
 
-def listed(path: str) -> Parts:
-    """Cameras in a list, named cam0 and so on."""
-    return lambda document: {f"cam{k}": part for k, part in enumerate(at(document.root, path).items())}
+def _whole_file(document: Document) -> Parts:
+    return {"camera": document.root}
 
 
-Poses = Callable[[Mapping[str, Field]], Sequence[Pose | None]]  # of the cameras of a file
-
-
-def table(
-    keys: CameraKeys,
-    matches: str | Callable[[Document], object],
-    files: str,
-    *,
-    parts: Parts = lambda document: {"camera": document.root},
-    pose: PoseKeys | Poses | None = None,
-    unit: str | Callable[[Field], str | None] | None = "m",
-    views: Callable[[Field], Mapping[str, Pose]] | None = None,
-    finish: Callable[[CameraSet, Mapping[str, Field], Document], CameraSet] | None = None,
-    project: bool = False,
-    write: Callable[[Any], str | bytes] | None = None,
-    whole: Callable[[list[Tree], CameraSet], Any] | None = None,
-    **properties: Any,
-) -> Format:
+@frozen_dataclass(eq=False)
+class Format(CameraKeys):
     """A format that is read, and perhaps written, by its tables.
 
-    Parameters
-    ----------
-    keys : CameraKeys
-        The keys of one camera.
-    matches : str or callable
-        Keys at the top of a file, by which it is told, or what tells it.
-    files : str
-        Its files, for the documentation.
-    parts : callable, optional
-        The tree of each camera of a file, by its name.
-    pose : PoseKeys or callable, optional
-        Keys of the pose in that tree, or what finds the poses of all.
-    unit : str or callable, optional
-        Unit of lengths, or what finds it in the tree of the first camera; None if a file does not state it.
-    views : callable, optional
-        What finds the poses of views in the tree of the first camera.
-    finish : callable, optional
-        What else is to be done with the cameras, their trees and the document.
-    project : bool
-        Whether the cameras of a file have no pose between them: one is read, or that which all are alike.
-    write, whole : callable, optional
-        How a tree becomes a text, and the trees of cameras one of a file. A format without `whole` is written
-        with one camera.
-    properties
-        Other attributes of `Format`.
+    One that is not told is not read.
     """
 
-    def read(document: Document) -> CameraSet:
+    files: str = ""  # its files, for the documentation
+    told: str | Callable[[Document], object] = ""  # keys at the top of a file, or what tells it
+    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = (
+        _whole_file  # or the path of a list of them
+    )
+    pose: PoseKeys | Callable[[Parts], Sequence[Pose | None]] | None = None  # keys of it, or what finds all
+    unit: str | Callable[[Field], str | None] | None = None  # of lengths, or what finds it in the first tree
+    views: Callable[[Field], Mapping[str, Pose]] | None = None  # what finds those of views in the first tree
+    remarks: Mapping[str, str] = field(
+        default_factory=dict
+    )  # if a number is neither 0 nor 1; {} is the number
+    finish: Callable[[CameraSet, Parts, Document], CameraSet] | None = None  # what else is to be done
+    project: bool = False  # whether the cameras have no pose between them: one is read, or all are alike
+    reader: Callable[[Document], CameraSet] | None = None  # in place of all of these
+    write: Callable[[Any], str | bytes] | None = None  # how a tree becomes a text
+    whole: Callable[[list[Tree], CameraSet], Any] | None = None  # the trees of cameras as one of a file
+    # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
+    texts: Callable[[CameraSet, str], Mapping[str, str | bytes]] | None = None
+    written: tuple[str, ...] = ()  # the models that are written, if not all of them
+    likely: bool = True  # whether files that are no camera may be like it by their keys
+    has_skew: bool = False  # whether its programs support skew, if no key tells it
+    poses: bool = False  # whether it contains the poses of views
+    most_cameras: int | None = None  # one, or any number of a rig, if it is not told
+    metres: bool = False  # whether lengths are in metres
+    needs_size: bool = False  # whether the image size must be known
+    rectified: bool = False  # whether it contains the rectification of a camera
+    square: bool = False  # whether its pixels are square
+    rig: str = ""  # how the poses of several cameras are stated, for the documentation
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Our names of the models that are written, the simplest first."""
+        return self.written or super().models
+
+    @property
+    def to(self) -> str:
+        """The value of the option ``--to``."""
+        return {"NumPy": "npz"}.get(self.program, self.program.lower())
+
+    @property
+    def holds_skew(self) -> bool:
+        """Whether its programs support skew."""
+        return self.has_skew or bool(self.skew)
+
+    @property
+    def most(self) -> int:
+        """How many cameras a file holds at most."""
+        pair = isinstance(self.pose, PoseKeys) and self.pose.from_first
+        return self.most_cameras or (2 if pair else 99 if self.rig else 1)
+
+    @property
+    def is_written(self) -> bool:
+        """Whether it is written."""
+        return self.write is not None or self.texts is not None
+
+    def matches(self, document: Document) -> object:
+        """Whether a file is of this format."""
+        if isinstance(self.told, str):
+            return self.told and set(self.told.split()) <= set(document.tree)
+        return self.told(document)
+
+    def read(self, document: Document) -> CameraSet:
+        """Read the cameras of a file."""
+        if self.reader is not None:
+            return self.reader(document)
+        parts: Mapping[str, Field | Tree]
+        if callable(self.parts):
+            parts = self.parts(document)
+        else:
+            parts = {f"cam{k}": part for k, part in enumerate(at(document.root, self.parts).items())}
         found = {
             name: one if isinstance(one, Field) else Field(one, document.source, name)
-            for name, one in parts(document).items()
+            for name, one in parts.items()
         }
-        cameras = in_poses(found)
-        if views is not None:
-            cameras = replace(cameras, poses=views(next(iter(found.values()))))
-        return cameras if finish is None else finish(cameras, found, document)
+        for part in found.values():
+            for path, remark in self.remarks.items():
+                if (stated := find(part, path)) is not None and (number := stated.number()) not in (0.0, 1.0):
+                    document.notes.append(f"{document.source}: {remark.format(number)}")
+        cameras = self._of_project(found) if self.project else self._mounted(found)
+        if self.views is not None:
+            cameras = replace(cameras, poses=self.views(next(iter(found.values()))))
+        return cameras if self.finish is None else self.finish(cameras, found, document)
 
-    def in_poses(found: Mapping[str, Field]) -> CameraSet:
-        if project:
-            one = only([keys.camera(part) for part in found.values()], found, keys.program)
-            seen = {} if not isinstance(pose, PoseKeys) else {name: pose.read(p) for name, p in found.items()}
-            return replace(one, poses={name: own for name, own in seen.items() if own is not None})
-        cameras = [keys.camera(part, name) for name, part in found.items()]
+    def _mounted(self, found: Parts) -> CameraSet:
+        """The cameras with the poses between them."""
+        cameras = [self.camera(part, name) for name, part in found.items()]
         poses: Sequence[Pose | None] = [None] * len(cameras)
-        if not isinstance(pose, PoseKeys):
-            poses = poses if pose is None else pose(found)
-        elif not pose.from_first:
-            poses = [pose.read(part) for part in found.values()]
+        if not isinstance(self.pose, PoseKeys):
+            poses = poses if self.pose is None else self.pose(found)
+        elif not self.pose.from_first:
+            poses = [self.pose.read(part) for part in found.values()]
         elif len(cameras) > 1:
-            poses = [STILL, *map(pose.read, list(found.values())[1:])]
-        placed = pose is not None and not (getattr(pose, "from_first", False) and len(cameras) == 1)
-        frame = getattr(pose, "frame", "body")
-        stated = unit(next(iter(found.values()))) if callable(unit) else unit if placed else None
-        return mounted(cameras, poses, keys.program, stated, frame)
+            poses = [STILL, *map(self.pose.read, list(found.values())[1:])]
+        alone = len(cameras) == 1 and getattr(self.pose, "from_first", self.pose is None)
+        unit = "m" if self.metres else self.unit
+        unit = unit(next(iter(found.values()))) if callable(unit) else None if alone else unit
+        return mounted(cameras, poses, self.program, unit, getattr(self.pose, "frame", "body"))
 
-    def text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-        assert write is not None
-        trees = [keys.tree(camera) for camera in cameras.cameras]
-        if isinstance(pose, PoseKeys) and made["most_cameras"] > 1:
-            start = int(pose.from_first)
+    def _of_project(self, found: Parts) -> CameraSet:
+        """The camera of a project, or that which all are alike, with its poses."""
+        cameras = [self.camera(part) for part in found.values()]
+        if not cameras:
+            raise InputError(f"is a project of {self.program} without a camera; calibrate it first")
+        alike = {
+            (*one.entries, one.distortion.model, *one.distortion.coefficients, one.image_size)
+            for one in cameras
+        }
+        if len(alike) > 1:
+            names = ", ".join(name[:30] for name in found)
+            raise InputError(
+                f"holds several cameras of {self.program} ({names}), which have no pose between them; save "
+                "one as a file"
+            )
+        poses = {}
+        if isinstance(self.pose, PoseKeys):
+            poses = {name: pose for name, part in found.items() if (pose := self.pose.read(part)) is not None}
+        return CameraSet((cameras[0],), poses=poses, program=self.program)
+
+    def text(self, cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
+        """Write cameras that fit the format."""
+        if self.texts is not None:
+            return self.texts(cameras, ending)
+        assert self.write is not None
+        trees = [self.tree(camera) for camera in cameras.cameras]
+        if isinstance(self.pose, PoseKeys) and self.most > 1:
+            start = int(self.pose.from_first)
             for tree, placed in zip(trees[start:], cameras.mounted[start:], strict=True):
-                pose.put(tree, placed)
-        return {"": write(trees[0] if whole is None else whole(trees, cameras))}
-
-    wanted = set(matches.split()) if isinstance(matches, str) else set()
-    found = {
-        "marks": keys.top,
-        "models": keys.models,
-        "skew": bool(keys.skew),
-        "first_pixel": keys.first_pixel,
-    }
-    made: dict[str, Any] = {"read": read, **({} if write is None else {"text": text}), **found}
-    made |= {"most_cameras": 2 if getattr(pose, "from_first", False) else 1, **properties}
-    told = (lambda document: wanted <= set(document.tree)) if isinstance(matches, str) else matches
-    return Format(keys.program, matches=told, files=files, **made)
-
-
-def only(cameras: Sequence[Camera], names: Mapping[str, Any], program: str) -> CameraSet:
-    """The one camera of a project; an InputError names those of several that differ."""
-    if not cameras:
-        raise InputError(f"is a project of {program} without a camera; calibrate it first")
-    alike = {
-        (*one.entries, one.distortion.model, *one.distortion.coefficients, one.image_size) for one in cameras
-    }
-    if len(alike) > 1:
-        listed = ", ".join(name[:30] for name in names)
-        raise InputError(
-            f"holds several cameras of {program} ({listed}), which have no pose between them; save one as a "
-            "file"
-        )
-    return CameraSet((cameras[0],), program=program)
+                self.pose.put(tree, placed)
+        return {"": self.write(trees[0] if self.whole is None else self.whole(trees, cameras))}

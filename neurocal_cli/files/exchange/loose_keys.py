@@ -20,7 +20,6 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, one_line
 from neurocal_cli.files.camera_tree import matrix_data
-from neurocal_cli.files.exchange.camera_keys import EIGHT
 from neurocal_cli.files.exchange.camera_names import (
     ALIKE,
     ENTRIES,
@@ -346,7 +345,7 @@ class LooseKeys:
                 radial.fail("2, 3 or 6 numbers")
             return [*[*k, 0.0][:2], *p, *(k[2:] or [0.0])], True
         values = {}
-        for name in EIGHT:
+        for name in MODELS["rational"]:
             entry = self.find(name, side, lambda v: is_numbers(v) and not isinstance(v, (list, dict)))
             if entry is not None:
                 values[name] = entry.number()
@@ -355,7 +354,7 @@ class LooseKeys:
         self.lacks = have_gap(values)
         if "k4" in values and not {"p1", "p2", "k5", "k6"} & set(values):  # as in a fisheye
             return [values.get(name, 0.0) for name in MODELS["fisheye"]], False
-        full = [values.get(name, 0.0) for name in EIGHT]
+        full = [values.get(name, 0.0) for name in MODELS["rational"]]
         return full if any(full[5:]) else full[:5], True
 
 

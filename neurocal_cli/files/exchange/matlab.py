@@ -14,14 +14,13 @@ import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_names import matrix_of
 from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector
 from neurocal_cli.files.exchange.document import Document, assignments
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.mat_file import MARK, lists, saved
-from neurocal_cli.files.exchange.tree_paths import arrays, numbers_at, under
+from neurocal_cli.files.exchange.tree_paths import arrays, numbers_at
 from neurocal_cli.files.tree_fields import Field
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
@@ -32,19 +31,7 @@ _CAMERAS = (
 STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 _OF_TWO = ("CameraParameters1", "CameraParameters2")
 
-_RADIAL, _TANGENTIAL = under("RadialDistortion/", "0", "1", "2"), under("TangentialDistortion/", "0", "1")
-_PARAMETERS = CameraKeys(
-    "MATLAB",
-    ("IntrinsicMatrix:transposed",),
-    (
-        Lens(("",), "k1k2p1p2", (*_RADIAL[:2], *_TANGENTIAL)),
-        Lens(("",), "plumb_bob", (*_RADIAL[:2], *_TANGENTIAL, _RADIAL[2])),
-    ),
-    size=("ImageSize/1", "ImageSize/0"),
-    first_pixel=FIRST_PIXEL,
-    optional="all",
-)
-_SECOND = PoseKeys(("RotationOfCamera2:transposed", "TranslationOfCamera2"), from_first=True)
+_SECOND = PoseKeys("RotationOfCamera2:transposed TranslationOfCamera2", from_first=True)
 _VIEWS, _UNIT = ("RotationMatrices", "TranslationVectors", "ViewNames"), "WorldUnits"
 _PLACES = [path.partition(":")[0] for path in _SECOND.paths]
 _ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
@@ -143,7 +130,7 @@ def _whole(trees: list[Tree], cameras: CameraSet) -> Tree:
 # Bouguet's toolbox: Calib_Results.mat and .m, and those of its stereo rigs.
 _SCRIPT = re.compile(r"^\s*fc(_left)?\s*=\s*\[", re.MULTILINE).search
 _VIEW = re.compile(r"(?:omc|Tc)_(\d+)").fullmatch
-_RIGHT = PoseKeys(("om", "T"), from_first=True)
+_RIGHT = PoseKeys("om T", from_first=True)
 
 
 def _bouguet_root(document: Document) -> Field:
@@ -162,7 +149,7 @@ def _bouguet_parts(document: Document) -> dict[str, Field]:
     for side in _sides(root):
         part = {key: root[f"{key}{side}"].value for key in ("fc", "cc", "kc")}
         part["skew"] = root.get(f"alpha_c{side}", 0.0).number() * root[f"fc{side}"].array(2)[0]
-        part |= {key: value for key, value in root.value.items() if key in _BOUGUET.size or _VIEW(key)}
+        part |= {key: value for key, value in root.value.items() if key in ("nx", "ny") or _VIEW(key)}
         if side == "_right":
             part |= {key: root[key].value for key in _RIGHT.paths}
         parts[side.removeprefix("_") or "camera"] = Field(part, root.source)
@@ -178,39 +165,43 @@ def _bouguet_views(root: Field) -> dict[str, Pose]:
     return poses
 
 
-_BOUGUET = CameraKeys(
+BOUGUET = Format(
     "MATLAB",
-    ("fc/0", "fc/1", "cc/0", "cc/1"),
-    (Lens(("",), "plumb_bob", under("kc/", *"01234")),),
-    size=("nx", "ny"),
+    "fc/0-1 cc/0-1",
+    "plumb_bob kc/0-4",
+    size="nx,ny",
     skew="skew",
-)
-BOUGUET = table(
-    _BOUGUET,
-    lambda document: (
+    told=lambda document: (
         _SCRIPT(document.text)
         or (document.data.startswith(MARK) and _sides(document.root) in ([""], ["_left", "_right"]))
     ),
-    "Calib_Results.mat and .m of Bouguet's toolbox",
+    files="Calib_Results.mat and .m of Bouguet's toolbox",
     parts=_bouguet_parts,
     pose=_RIGHT,
-    unit=None,
     views=_bouguet_views,
     poses=True,
     rig="`om, T` from the left to the right camera",
 )
-MATLAB = table(
-    _PARAMETERS,
-    _matches,
-    ".mat with a struct, whose first pixel is 1",
+MATLAB = Format(
+    "MATLAB",
+    "IntrinsicMatrix:transposed",
+    """
+    k1k2p1p2 RadialDistortion/0-1 TangentialDistortion/0-1
+    plumb_bob RadialDistortion/0-1 TangentialDistortion/0-1 RadialDistortion/2
+    """,
+    size="ImageSize/1,0",
+    first_pixel=FIRST_PIXEL,
+    optional="all",
+    told=_matches,
+    files=".mat with a struct, whose first pixel is 1",
     parts=_parts,
     pose=_SECOND,
     unit=lambda root: unit_of(root.value),
     views=_views,
     write=lambda tree: saved(arrays(tree)),
     whole=_whole,
-    marks=frozenset(),
-    skew=True,
+    likely=False,
+    has_skew=True,
     poses=True,
     needs_size=True,
     rig="`RotationOfCamera2`, transposed",

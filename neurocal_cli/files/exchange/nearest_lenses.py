@@ -12,6 +12,7 @@ not about the principal point. If these differ, the camera becomes the nearest o
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,16 +21,16 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import fitted_to_rays
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_names import matrix_of
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, mounted
+from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys
-from neurocal_cli.files.exchange.tree_paths import in_order
+from neurocal_cli.files.exchange.format_table import Format, Parts, PoseKeys, Tree
+from neurocal_cli.files.exchange.tree_paths import in_order, in_rows
 from neurocal_cli.files.reading import read_text
-from neurocal_cli.files.tree_fields import Field, is_number
+from neurocal_cli.files.tree_fields import Field
 
 _SAMPLES = 400  # of the curve, from the centre to the farthest corner
 _WORST = 3.0  # px; a camera that differs more is refused
@@ -58,33 +59,37 @@ def fitted(
     return float(c[0]), Distortion("fisheye", c[1:] / c[0])
 
 
-def fov(camera: Camera, omega: float, document: Document) -> Camera:
-    """A camera of Devernay and Faugeras (2001): r = atan(2 tan(theta) tan(omega / 2)) / omega."""
+def with_fov(found: CameraSet, parts: Parts, document: Document) -> CameraSet:
+    """The camera, if its lens is FOV that of Devernay and Faugeras (2001).
+
+    r = atan(2 tan(theta) tan(omega / 2)) / omega.
+    """
+    tree, camera = parts["camera"].value, found.cameras[0]
+    omega = tree["D"][0] if tree["model"] == "FOV" else 0.0
     if abs(omega) < _STRAIGHT:
-        return camera
+        return found
     fx, _, fy, u0, v0 = camera.entries
     width, height = camera.image_size or (2 * u0, 2 * v0)
     corner = np.hypot(max(u0, width - u0) / fx, max(v0, height - v0) / fy)
     radius = np.linspace(0, min(corner, 0.99 * np.pi / 2 / omega), _SAMPLES)
     theta = np.arctan2(np.sin(radius * omega), 2 * np.tan(omega / 2) * np.cos(radius * omega))
     f, lens = fitted(theta, radius, max(fx, fy), document, f"the FOV model with omega = {omega:g}")
-    return Camera(Intrinsics(f * fx, f * fy, u0, v0), lens, camera.image_size, camera.name)
+    A = Intrinsics(f * fx, f * fy, u0, v0)
+    return replace(found, cameras=(replace(camera, intrinsics=A, distortion=lens),))
 
 
 # OCamCalib (Scaramuzza 2006). A pixel is [row, column] = [[c, d], [e, 1]] rho (x, y) / |(x, y)| + centre,
 # with x down and y right, and the ray (x, y, f(rho)) has z backwards.
-_MARK = "polynomial coefficients for the DIRECT mapping"
+_MARK = re.compile(r"#polynomial|.{,500}polynomial coefficients for the DIRECT mapping", re.DOTALL).match
 
 
-def _read_ocam(document: Document) -> CameraSet:
-    rows = [line.split() for line in document.text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
-    if [len(row) for row in rows[2:5]] != [2, 3, 2] or not all(is_number(w) for row in rows for w in row):
+def _ocam_parts(document: Document) -> dict[str, Tree]:
+    order = "direct:,inverse:,row column,c d e,height width"
+    if (found := in_rows(order, document.text, document.source)) is None:
         raise InputError(
             "is a damaged file of OCamCalib: it has not all its blocks of numbers; save it again"
         )
-    direct, _, (row, column), (c, d, e), (height, width) = (
-        Field(numbers, document.source, "a block").array(-1) for numbers in rows[:5]
-    )
+    direct, _, row, column, c, d, e, height, width = found.value.values()
     if len(direct) != direct[0] + 1 or direct[1] == 0:
         raise InputError(
             "the polynomial of OCamCalib has another number of coefficients than it says; correct it"
@@ -103,15 +108,25 @@ def _read_ocam(document: Document) -> CameraSet:
             f"{document.source}: the camera is turned about its axis by {np.degrees(turn):.3g} degrees from "
             "OCamCalib's, so that its rows lie along x"
         )
-    K = np.array([[A[0, 0], A[0, 1], column], [0.0, A[1, 1], row], [0.0, 0.0, 1.0]])
-    camera = Camera(Intrinsics.from_matrix(K), lens, (int(width), int(height)))
-    return CameraSet((camera,), program="OCamCalib")
+    K = matrix_of(A[0, 0], A[1, 1], column, row, A[0, 1])
+    return {"camera": {"K": K.tolist(), "k": lens.coefficients.tolist(), "size": [width, height]}}
+
+
+OCAM = Format(
+    "OCamCalib",
+    "K",
+    "fisheye k",
+    size="size",
+    told=lambda document: _MARK(document.text[:600]),
+    files="calib_results.txt, as the nearest fisheye",
+    parts=_ocam_parts,
+    has_skew=True,
+)
 
 
 # WoodScape: the radius [px] is a polynomial of the angle [rad], about a point from the middle of the image.
-# The pose is that of the camera in the vehicle.
+# The pose is that of the camera in the vehicle, its quaternion x, y, z, w.
 _WOODSCAPE = ("k1", "k2", "k3", "k4", "cx_offset", "cy_offset", "width", "height")
-_IN_VEHICLE = PoseKeys(("quaternion", "translation"), back=True)
 
 
 def _is_woodscape(document: Document) -> bool:
@@ -119,9 +134,8 @@ def _is_woodscape(document: Document) -> bool:
     return isinstance(own, dict) and own.keys() >= set(_WOODSCAPE) and own.get("model") == "radial_poly"
 
 
-def _read_woodscape(document: Document) -> CameraSet:
-    root = document.root
-    own = root["intrinsic"]
+def _woodscape_parts(document: Document) -> dict[str, Tree]:
+    own = document.root["intrinsic"]
     *k, u0, v0, _, _ = (own[key].number() for key in _WOODSCAPE)
     width, height = own["width"].integer(1), own["height"].integer(1)
     u0, v0 = u0 + 0.5 * (width - 1), v0 + 0.5 * (height - 1)
@@ -131,47 +145,29 @@ def _read_woodscape(document: Document) -> CameraSet:
     radius = np.polynomial.polynomial.polyval(theta, np.array([0.0, *k]))
     end = int(np.argmax((radius > far) | (np.gradient(radius) <= 0))) or len(theta)
     f, lens = fitted(theta[:end], radius[:end], 1.0, document, "the polynomial of WoodScape")
-    camera = Camera(
-        Intrinsics(f, f * aspect, u0, v0), lens, (width, height), root.get("name", "camera").text()
-    )
-    body = root.get("extrinsic", {})
-    if "quaternion" in body:  # x, y, z, w
-        x, y, z, w = body["quaternion"].array(4).tolist()
-        body = Field({**body.value, "quaternion": [w, x, y, z]}, root.source, "extrinsic")
-    return mounted([camera], [_IN_VEHICLE.read(body)], "WoodScape", "m", "vehicle")
+    K, size = matrix_of(f, f * aspect, u0, v0).tolist(), [width, height]
+    return {"camera": {**document.tree, "K": K, "k": lens.coefficients.tolist(), "size": size}}
 
 
 WOODSCAPE = Format(
     "WoodScape",
-    ("fisheye",),
-    matches=_is_woodscape,
-    read=_read_woodscape,
+    "K",
+    "fisheye k",
+    size="size",
+    name="name",
+    told=_is_woodscape,
     files="calibration of WoodScape, JSON, as the nearest fisheye",
+    parts=_woodscape_parts,
+    pose=PoseKeys("extrinsic/quaternion/3,0,1,2 extrinsic/translation", back=True, frame="vehicle"),
+    metres=True,
 )
 
-OCAM = Format(
-    "OCamCalib",
-    ("fisheye",),
-    matches=lambda document: _MARK in document.text[:500] or re.match(r"#polynomial", document.text),
-    read=_read_ocam,
-    files="calib_results.txt, as the nearest fisheye",
-    skew=True,
-)
-
-
-_ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines
-_ORDER = "place:3 angles:3 R:9 centre:2 f glass:3"
-_LENS = "k1 k2 k3 p1 p2 scale shear"
+ORIENTATION = "place:3,angles:3,R:9/3,centre:2,f,glass:3"  # the rows of a .ori of OpenPTV
+LENS = "k1 k2 k3 p1 p2 scale shear"  # that of its .addpar
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _GRID = 15  # rays along each side of the image
-_RUN = ("imx", "imy", "pix_x", "pix_y", "mmp_n1", "mmp_n2", "mmp_n3")
+_PIXELS = ("imx", "imy", "pix_x", "pix_y", "mmp_n1", "mmp_n2", "mmp_n3")
 _PAR = ("ptv.par", "../parameters/ptv.par", "parameters/ptv.par", "../ptv.par")
-
-
-def numbers_in_lines(document: Document) -> list[int]:
-    """How many numbers each line has; none if there are words, or many lines."""
-    lines = [line.split() for line in document.text[:2000].splitlines() if line.strip()]
-    return [len(line) for line in lines] if all(is_number(w) for line in lines for w in line) else []
 
 
 def _pixels(path: Path) -> tuple[list[float], bool]:
@@ -207,52 +203,48 @@ def _of_par(place: Path) -> list[float]:
 def _of_run(place: Path) -> list[float]:
     """The same of a run of pyptv."""
     ptv = parse_tree(*read_text(place))["ptv"]
-    return [ptv[name].number() for name in _RUN]
+    return [ptv[name].number() for name in _PIXELS]
 
 
-def _read(document: Document) -> CameraSet:
-    own = in_order(_ORDER, document.text.split(), document.source)
+def _openptv_parts(document: Document) -> dict[str, Tree]:
+    own = in_rows(ORIENTATION, document.text, document.source)
+    assert own is not None  # `told`
     path = Path(document.source)
-    (width, height, du, dv), broken = _pixels(path)
+    pixels, broken = _pixels(path)
     lens = path.with_suffix(".addpar")
-    k = Field({**dict.fromkeys(_LENS.split(), 0.0), "scale": 1.0}, document.source)
+    k = Field({**dict.fromkeys(LENS.split(), 0.0), "scale": 1.0}, document.source)
     if lens.exists():
         text, source = read_text(lens)
-        k = in_order(_LENS, text.split(), source)
+        k = in_order(LENS, text.split(), source)
     else:
         document.warnings.append(f"{document.source}: there is no {lens.name}, so it has no distortion")
-    size, side, name = (int(width), int(height)), (du, dv), path.name.split(".")[0]
-    camera = _camera(own["centre"].array(2), own["f"].number(), k, size, side, document, name)
+    camera = _camera(own, k, pixels, document)
     R = _FLIP @ own["R"].array(9).reshape(3, 3).T
+    pose = {"R": R.tolist(), "t": (-R @ own["place"].array(3)).tolist()}
     if broken:
         document.notes.append(f"{document.source}: rays are broken at glass, so its pose is left out")
-    pose = None if broken else Pose(R, -R @ own["place"].array(3))
-    return mounted([camera], [pose], "OpenPTV", "mm", "world")
+    tree = {"K": camera.A.tolist(), "D": camera.distortion.coefficients.tolist() or [0.0], "size": pixels[:2]}
+    return {path.name.split(".")[0]: {**tree, **({} if broken else pose)}}
 
 
-def _camera(
-    centre: Array,
-    f: float,
-    lens: Field,
-    size: tuple[int, int],
-    side: tuple[float, float],
-    document: Document,
-    name: str,
-) -> Camera:
-    k1, k2, k3, p1, p2, scale, shear = (lens[key].number() for key in _LENS.split())
-    affine = np.array([[scale, np.sin(shear)], [0.0, np.cos(shear)]]) / np.array(side)[:, None]
-    middle = 0.5 * np.array(size) - 0.5
+def _camera(own: Field, lens: Field, pixels: list[float], document: Document) -> Camera:
+    """The camera of an orientation and its distortion, or the nearest one."""
+    centre, f = own["centre"].array(2), own["f"].number()
+    k1, k2, k3, p1, p2, scale, shear = (lens[key].number() for key in LENS.split())
+    size, side = np.array(pixels[:2]), np.array(pixels[2:])
+    affine = np.array([[scale, np.sin(shear)], [0.0, np.cos(shear)]]) / side[:, None]
+    middle = 0.5 * size
     origin = centre * [1, -1]  # y down
 
     start = np.array([*(f * affine).ravel()[[0, 1, 3]], *(affine @ origin + middle)])
     k = np.array([k1 * f**2, k2 * f**4, -p2 * f, p1 * f, k3 * f**6])
     a, skew, b, u0, v0 = start
     A = Intrinsics.from_matrix(matrix_of(a, b, u0, v0, skew))
-    exact = Camera(A, Distortion("plumb_bob", k) if k.any() else Distortion(), size, name)
+    exact = Camera(A, Distortion("plumb_bob", k) if k.any() else Distortion(), (int(size[0]), int(size[1])))
     if not (k.any() and origin.any()):
         return exact
     # Pixels of rays by OpenPTV's formula, and the camera of OpenCV's that is nearest to them.
-    corner = np.abs(np.linalg.inv(affine)) @ (0.5 * np.array(size))
+    corner = np.abs(np.linalg.inv(affine)) @ (0.5 * size)
     grid = np.stack(np.meshgrid(*(np.linspace(-c, c, _GRID) for c in corner)), axis=-1).reshape(-1, 2)
     x, y = grid.T
     r = x**2 + y**2
@@ -261,12 +253,12 @@ def _camera(
         x * radial + p1 * (r + 2 * x**2) - 2 * p2 * x * y,
         y * radial - p2 * (r + 2 * y**2) + 2 * p1 * x * y,
     ]
-    pixels = np.array(bent).T @ affine.T + middle
+    there = np.array(bent).T @ affine.T + middle
     rays = np.column_stack([(grid - origin) / f, np.ones(len(grid))])
 
-    found = fitted_to_rays(exact, "plumb_bob", np.array([*start, *k]), True, rays, pixels)
+    found = fitted_to_rays(exact, "plumb_bob", np.array([*start, *k]), True, rays, there)
     near = exact if found is None else found[0]
-    worst = float(np.hypot(*(near.project(rays)[0] - pixels).T).max())
+    worst = float(np.hypot(*(near.project(rays)[0] - there).T).max())
     if worst > _WORST:
         raise InputError(
             f"no camera of OpenCV's is within {_WORST:g} px of this one; calibrate from its points"
@@ -280,10 +272,14 @@ def _camera(
 
 OPENPTV = Format(
     "OpenPTV",
-    ("none", "plumb_bob"),
-    matches=lambda document: numbers_in_lines(document) == _ORIENTATION,
-    read=_read,
+    "K",
+    "plumb_bob D",
+    size="size",
+    told=lambda document: in_rows(ORIENTATION, document.text),
     files=".ori with its .addpar; ptv.par beside it or in ../parameters, or a run of pyptv",
-    skew=True,
+    parts=_openptv_parts,
+    pose=PoseKeys("R t", frame="world"),
+    unit="mm",
+    has_skew=True,
     first_pixel=0.5,
 )

@@ -19,8 +19,9 @@ from neurocal_cli.files.calibration_yaml import (
     neurocal_block,
 )
 from neurocal_cli.files.camera_tree import own_kind
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.format_table import Format
 from neurocal_cli.files.rig_yaml import format_rig, format_stereo_rig, rig_from_field, stereo_from_field
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences
@@ -145,7 +146,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": format_rig(result) if isinstance(result, Rig) else format_stereo_rig(result)}
 
 
-def matches(document: Document) -> bool:
+def _matches(document: Document) -> bool:
     """Whether this is a calibration or a rig of neurocal."""
     tree = document.tree
     rig = "cameras" in tree and "rig" in tree
@@ -155,20 +156,14 @@ def matches(document: Document) -> bool:
     return "neurocal" in tree or rig or pair or "neurocal_lens" in tree
 
 
-def read(document: Document) -> CameraSet:
-    """Read a calibration or a rig."""
-    return from_tree(document.root, whole=True)
-
-
 FORMAT = Format(
     "neurocal",
-    tuple(MODELS),
-    _text,
-    matches,
-    read,
     files="its own, YAML or JSON",
-    skew=True,
+    told=_matches,
+    reader=lambda document: from_tree(document.root, whole=True),
+    texts=_text,
+    written=tuple(MODELS),
+    has_skew=True,
     poses=True,
-    most_cameras=99,
     rig="`X_name = R X_first + t`",
 )

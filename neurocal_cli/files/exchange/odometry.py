@@ -7,36 +7,19 @@ single camera becomes its view ``body``. The centre of the first pixel is (0, 0)
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, K4, RADTAN, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, listed, table
-from neurocal_cli.files.exchange.nearest_lenses import fov
-from neurocal_cli.files.exchange.tree_paths import find, in_order, json_text, under, yaml_text
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.nearest_lenses import with_fov
+from neurocal_cli.files.exchange.tree_paths import find, in_order, json_text, yaml_text
 from neurocal_cli.files.tree_fields import Field
+
 
 # ORB-SLAM2 and 3: keys that begin with Camera, and those of two cameras with Camera1 and Camera2. OpenVSLAM
 # and stella_vslam have other names of the model and the size, and perhaps a mapping.
-_ORDINARY = ("PinHole", "Rectified", "perspective")
-_ORB = CameraKeys(
-    "ORB-SLAM",
-    ("fx", "fy", "cx", "cy"),
-    (
-        Lens(_ORDINARY, "k1k2p1p2", RADTAN),
-        Lens(_ORDINARY, "plumb_bob", FIVE),
-        Lens(("KannalaBrandt8", "fisheye"), "fisheye", K4),
-    ),
-    model="type",
-    size=("width", "height"),
-    optional="all",
-    aside=("bf", "fps", "focal_x_baseline", "depth_threshold", "imageScale"),
-)
-
-
 def _orb_parts(document: Document) -> dict[str, Field]:
     root = document.root
     if "LEFT.K" in root:
@@ -62,109 +45,92 @@ def _storage(tree: Tree) -> str:
     return yaml_text(tree, "%YAML:1.0\n---\n")
 
 
-STELLA = table(
-    replace(_ORB, program="OpenVSLAM", model="model", size=("cols", "rows")),
-    lambda document: (
+STELLA = Format(
+    "OpenVSLAM",
+    "fx,fy,cx,cy",
+    """
+    PinHole, Rectified, perspective: k1k2p1p2 *
+    PinHole, Rectified, perspective: plumb_bob *
+    KannalaBrandt8, fisheye: fisheye *
+    """,
+    model="model",
+    size="cols,rows",
+    optional="all",
+    aside="bf fps focal_x_baseline depth_threshold imageScale",
+    told=lambda document: (
         "Camera.model" in document.tree
         or (isinstance(below := document.tree.get("Camera"), dict) and {"model", "setup"} <= set(below))
     ),
-    "OpenVSLAM, stella_vslam: YAML",
+    files="OpenVSLAM, stella_vslam: YAML",
     parts=_orb_parts,
 )
-ORB_SLAM = table(
-    _ORB,
-    lambda document: not {"Camera.fx", "Camera1.fx"}.isdisjoint(document.tree),
-    "settings of ORB-SLAM2 and 3: YAML",
-    parts=_orb_parts,
-    pose=PoseKeys(("Stereo.T_c1_c2",), back=True, from_first=True),
+ORB_SLAM = replace(
+    STELLA,
+    program="ORB-SLAM",
+    start="Camera.",
+    model="type",
+    size="width,height",
+    told=lambda document: not {"Camera.fx", "Camera1.fx"}.isdisjoint(document.tree),
+    files="settings of ORB-SLAM2 and 3: YAML",
+    pose=PoseKeys("Stereo.T_c1_c2", back=True, from_first=True),
     write=_storage,
     whole=lambda trees, cameras: {f"Camera.{key}": value for key, value in trees[0].items()},
     most_cameras=1,
-    marks=frozenset(f"Camera.{key}" for key in ("type", "fx", "fy", "cx", "cy", "width", "height")),
+    metres=True,
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
 )
 
 # VINS and camodocal. Their Kannala-Brandt is r = theta + k2 theta^3 + ..., so its k2 is our k1.
-_D, _P = "distortion_parameters/", "projection_parameters/"
-_VINS = CameraKeys(
+_P = "projection_parameters"
+VINS = Format(
     "VINS",
-    under(_P, "fx", "fy", "cx", "cy"),
-    (
-        Lens(("PINHOLE",), "k1k2p1p2", under(_D, *RADTAN)),
-        Lens(
-            ("MEI",),
-            "omnidir",
-            ("mirror_parameters/xi", *under(_D, *RADTAN)),
-            under(_P, "gamma1", "gamma2", "u0", "v0"),
-        ),
-        Lens(
-            ("KANNALA_BRANDT",),
-            "fisheye",
-            under(_P, "k2", "k3", "k4", "k5"),
-            under(_P, "mu", "mv", "u0", "v0"),
-        ),
-    ),
+    f"{_P}/fx,fy,cx,cy",
+    f"""
+    PINHOLE: k1k2p1p2 distortion_parameters/*
+    MEI: omnidir mirror_parameters/xi distortion_parameters/k1,k2,p1,p2 of {_P}/gamma1,gamma2,u0,v0
+    KANNALA_BRANDT: fisheye {_P}/k2-5 of {_P}/mu,mv,u0,v0
+    """,
     model="model_type",
-    size=("image_width", "image_height"),
+    size="image_width,image_height",
     name="camera_name",
-)
-VINS = table(
-    _VINS,
-    "model_type projection_parameters",
-    "VINS-Mono, VINS-Fusion, camodocal: YAML",
+    told="model_type projection_parameters",
+    files="VINS-Mono, VINS-Fusion, camodocal: YAML",
     write=_storage,
 )
 
+
 # EuRoC's sensor.yaml: T_BS maps the camera to the body.
-_EUROC = CameraKeys(
-    "EuRoC",
-    ("intrinsics:list",),
-    (
-        Lens(("radial-tangential", "radtan", "plumb_bob"), "k1k2p1p2", ("distortion_coefficients",)),
-        Lens(("equidistant", "equi"), "fisheye", ("distortion_coefficients",)),
-    ),
-    model="distortion_model",
-    size=("resolution",),
-    constants={"sensor_type": "camera", "camera_model": "pinhole"},
-)
-
-
 def _euroc_parts(document: Document) -> dict[str, Field]:
     if (model := find(document.root, "camera_model")) is not None and model.text() != "pinhole":
         model.fail("pinhole")
     return {"camera": document.root}
 
 
-EUROC = table(
-    _EUROC,
-    lambda document: (
+EUROC = Format(
+    "EuRoC",
+    "intrinsics:list",
+    """
+    radial-tangential, radtan, plumb_bob: k1k2p1p2 distortion_coefficients
+    equidistant, equi: fisheye distortion_coefficients
+    """,
+    model="distortion_model",
+    size="resolution",
+    constants={"sensor_type": "camera", "camera_model": "pinhole"},
+    told=lambda document: (
         document.tree.get("sensor_type") == "camera" or {"T_BS", "intrinsics"} <= set(document.tree)
     ),
-    "sensor.yaml of the EuRoC data set",
+    files="sensor.yaml of the EuRoC data set",
     parts=_euroc_parts,
-    pose=PoseKeys(("T_BS",), back=True),
+    pose=PoseKeys("T_BS", back=True),
+    most_cameras=1,
+    metres=True,
     write=yaml_text,
     needs_size=True,
     rig="two files, `T_BS` from each camera to the body (read)",
 )
 
+
 # Basalt: lists of cameras, of their sizes, and of their poses into the IMU.
-_BASALT = CameraKeys(
-    "Basalt",
-    under("intrinsics/", "fx", "fy", "cx", "cy"),
-    (
-        Lens(("pinhole",), "none", ()),
-        Lens(("pinhole-radtan8",), "rational", under("intrinsics/", *EIGHT)),
-        Lens(("kb4",), "fisheye", under("intrinsics/", *K4)),
-        Lens(("ds",), "double_sphere", under("intrinsics/", "xi", "alpha")),
-        Lens(("eucm",), "eucm", under("intrinsics/", "alpha", "beta")),
-    ),
-    model="camera_type",
-    size=("resolution",),
-)
-_TO_IMU = PoseKeys(("T_imu_cam/qw,qx,qy,qz:quaternion", "T_imu_cam/px,py,pz"), back=True, frame="imu")
-
-
 def _basalt_parts(document: Document) -> dict[str, Tree]:
     root = document.root.get("value0", document.tree)
     cameras, sizes = (list(root[key].items()) for key in ("intrinsics", "resolution"))
@@ -183,117 +149,97 @@ def _basalt_tree(trees: list[Tree], cameras: CameraSet) -> Tree:
     return {"value0": {**apart, "intrinsics": trees}}
 
 
-BASALT = table(
-    _BASALT,
-    lambda document: (
+BASALT = Format(
+    "Basalt",
+    "intrinsics/fx,fy,cx,cy",
+    """
+    pinhole: none
+    pinhole-radtan8: rational intrinsics/*
+    kb4: fisheye intrinsics/*
+    ds: double_sphere intrinsics/*
+    eucm: eucm intrinsics/*
+    """,
+    model="camera_type",
+    size="resolution",
+    told=lambda document: (
         {"intrinsics", "resolution"} <= set(document.tree.get("value0", document.tree) or ())
         and "camera_type" in str(document.tree)[:100_000]
     ),
-    "calibration.json",
+    files="calibration.json",
     parts=_basalt_parts,
-    pose=_TO_IMU,
+    pose=PoseKeys("T_imu_cam/qw,qx,qy,qz:quaternion T_imu_cam/px,py,pz", back=True, frame="imu"),
     write=json_text,
     whole=_basalt_tree,
-    most_cameras=99,
     metres=True,
     needs_size=True,
     rig="`T_imu_cam` from each camera to the IMU",
 )
 
+
 # OKVIS and SVO: lists of cameras with their poses into the body.
-_OKVIS = CameraKeys(
-    "OKVIS",
-    ("focal_length/0", "focal_length/1", "principal_point/0", "principal_point/1"),
-    (
-        Lens(("radialtangential",), "k1k2p1p2", ("distortion_coefficients",)),
-        Lens(("equidistant",), "fisheye", ("distortion_coefficients",)),
-        Lens(("radialtangential8",), "rational", ("distortion_coefficients",)),
-        Lens(("none",), "none", ()),
-    ),
-    model="distortion_type",
-    size=("image_dimension",),
-)
-_SVO = CameraKeys(
-    "SVO",
-    ("camera/intrinsics:column",),
-    (
-        Lens(("radial-tangential",), "k1k2p1p2", ("camera/distortion/parameters:column",)),
-        Lens(("equidistant",), "fisheye", ("camera/distortion/parameters:column",)),
-        Lens(("none",), "none", ()),
-    ),
-    model="camera/distortion/type",
-    size=("camera/image_width", "camera/image_height"),
-    name="camera/label",
-)
-
-
 def _first_camera(document: Document) -> dict[str, Any]:
     cameras = document.tree.get("cameras")
     first = cameras[0] if isinstance(cameras, list) and cameras else {}
     return first if isinstance(first, dict) else {}
 
 
-OKVIS = table(
-    _OKVIS,
-    lambda document: "focal_length" in _first_camera(document),
-    "its configuration, YAML",
-    parts=listed("cameras"),
-    pose=PoseKeys(("T_SC",), back=True),
-    most_cameras=99,
+OKVIS = Format(
+    "OKVIS",
+    "focal_length/0,1 principal_point/0,1",
+    """
+    radialtangential: k1k2p1p2 distortion_coefficients
+    equidistant: fisheye distortion_coefficients
+    radialtangential8: rational distortion_coefficients
+    none: none
+    """,
+    model="distortion_type",
+    size="image_dimension",
+    told=lambda document: "focal_length" in _first_camera(document),
+    files="its configuration, YAML",
+    parts="cameras",
+    pose=PoseKeys("T_SC", back=True),
     metres=True,
     rig="`T_SC` from each camera to the body",
 )
-SVO = table(
-    _SVO,
-    lambda document: "camera" in _first_camera(document),
-    "SVO, rpg_vikit, maplab: YAML",
-    parts=listed("cameras"),
-    pose=PoseKeys(("T_B_C",), back=True),
-    most_cameras=99,
+SVO = Format(
+    "SVO",
+    "camera/intrinsics:column",
+    """
+    radial-tangential: k1k2p1p2 camera/distortion/parameters:column
+    equidistant: fisheye camera/distortion/parameters:column
+    none: none
+    """,
+    model="camera/distortion/type",
+    size="camera/image_width,image_height",
+    name="camera/label",
+    told=lambda document: "camera" in _first_camera(document),
+    files="SVO, rpg_vikit, maplab: YAML",
+    parts="cameras",
+    pose=PoseKeys("T_B_C", back=True),
     metres=True,
     rig="`T_B_C` from each camera to the body",
 )
 
-
 # rpg_vikit's cameras, also of FAST-LIVO, with d0 to d4 in OpenCV's order.
-_VIKIT = CameraKeys(
+VIKIT = Format(
     "vikit",
-    under("cam_", "fx", "fy", "cx", "cy"),
-    (
-        Lens(("Pinhole",), "k1k2p1p2", under("cam_d", "0", "1", "2", "3")),
-        Lens(("Pinhole",), "plumb_bob", under("cam_d", "0", "1", "2", "3", "4")),
-        Lens(("EquidistantCamera",), "fisheye", K4),
-    ),
+    "cam_fx,cam_fy,cam_cx,cam_cy",
+    """
+    Pinhole: k1k2p1p2 cam_d0-3
+    Pinhole: plumb_bob cam_d0-4
+    EquidistantCamera: fisheye *
+    """,
     model="cam_model",
-    size=("cam_width", "cam_height"),
+    size="cam_width,cam_height",
     optional="all",
-    aside=("scale",),
+    aside="scale",
+    told="cam_model cam_fx",
+    files="camera of rpg_vikit, FAST-LIVO: YAML",
+    remarks={"scale": "the camera is that of the images before the scale {:g}"},
 )
-
-
-def _vikit_parts(document: Document) -> dict[str, Field]:
-    if (scale := document.root.get("scale", 1.0).number()) != 1:
-        document.notes.append(
-            f"{document.source}: the camera is that of the images before the scale {scale:g}"
-        )
-    return {"camera": document.root}
-
-
-VIKIT = table(_VIKIT, "cam_model cam_fx", "camera of rpg_vikit, FAST-LIVO: YAML", parts=_vikit_parts)
 
 # DSO: a line of the model and its numbers, and a line of the size of the images. A principal point below 1 is
 # relative to it, with the first pixel at 1/2. FOV with omega = 0 is a pinhole.
-_DSO = CameraKeys(
-    "DSO",
-    ("fx", "fy", "cx", "cy"),
-    (
-        Lens(("Pinhole", "FOV"), "none", ()),
-        Lens(("RadTan",), "k1k2p1p2", ("D",)),
-        Lens(("EquiDistant", "KannalaBrandt"), "fisheye", ("D",)),
-    ),
-    model="model",
-    size=("size",),
-)
 _DSO_LINES = re.compile(
     r"\A(?:(Pinhole|RadTan|EquiDistant|KannalaBrandt|FOV)\s)?((?:\s*[-+.\deE]+){5,8})"
     r"[ \t]*\n\s*(\d+[ \t]+\d+)\s*\n(?:crop|full|none|fillImg|[-+.\d])"
@@ -313,17 +259,18 @@ def _dso_parts(document: Document) -> dict[str, Field]:
     return {"camera": root}
 
 
-def _with_omega(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
-    tree = parts["camera"].value
-    if tree["model"] != "FOV":
-        return found
-    return replace(found, cameras=(fov(found.cameras[0], tree["D"][0], document),))
-
-
-DSO = table(
-    _DSO,
-    lambda document: _DSO_LINES(document.text),
-    "camera.txt of DSO, LDSO, TUM's monocular data",
+DSO = Format(
+    "DSO",
+    "fx,fy,cx,cy",
+    """
+    Pinhole, FOV: none
+    RadTan: k1k2p1p2 D
+    EquiDistant, KannalaBrandt: fisheye D
+    """,
+    model="model",
+    size="size",
+    told=lambda document: _DSO_LINES(document.text),
+    files="camera.txt of DSO, LDSO, TUM's monocular data",
     parts=_dso_parts,
-    finish=_with_omega,
+    finish=with_fov,
 )

@@ -9,36 +9,21 @@ import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import FIVE, K4, RADTAN, CameraKeys, Lens
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after
+from neurocal_cli.files.exchange.camera_set import CameraSet, after
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
-from neurocal_cli.files.exchange.tree_paths import json_text, under
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.tree_paths import json_text
 from neurocal_cli.files.tree_fields import Field
 
 # nerfstudio and instant-ngp; poses map the camera to the world, with x right, y up, z backwards.
 _ASIDE = (
-    "camera_angle_x", "camera_angle_y", "scale", "aabb_scale", "offset", "integer_depth_scale", "fps",
-    "timestamp", "time", "sharpness", "x_fov", "y_fov",
-)  # fmt: skip
-_NERF = CameraKeys(
-    "nerfstudio",
-    ("fl_x", "fl_y", "cx", "cy"),
-    (
-        Lens(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"), "k1k2p1p2", RADTAN),
-        Lens(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"), "plumb_bob", FIVE),
-        Lens(("OPENCV_FISHEYE",), "fisheye", K4),
-    ),
-    model="camera_model",
-    size=("w", "h"),
-    first_pixel=0.5,
-    optional="any",
-    aside=_ASIDE,
+    "camera_angle_x camera_angle_y scale aabb_scale offset integer_depth_scale fps timestamp time sharpness "
+    "x_fov y_fov"
 )
 _LEAST = 20.0  # px of a focal length or a principal point
-_OWN = {"fl_x", "fl_y", "cx", "cy", "w", "h", *FIVE, "k4"}
+_OWN = {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2"}
 _FLIP = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
-_FRAME = PoseKeys(("transform_matrix",), back=True)
+_FRAME = PoseKeys("transform_matrix", back=True)
 
 
 def _nerf_parts(document: Document) -> dict[str, Field]:
@@ -66,7 +51,7 @@ def _nerf_parts(document: Document) -> dict[str, Field]:
         tree["fl_x"] = 0.5 * root["w"].number() / float(np.tan(half))
     missing = [key for key in ("fl_y", "cx", "cy") if key not in tree]
     for key, value in {**tree, **(frames[0] if frames else {})}.items() if missing else ():
-        if isinstance(value, float) and value > _LEAST and key not in (*_OWN, *_ASIDE):
+        if isinstance(value, float) and value > _LEAST and key not in (*_OWN, *_ASIDE.split()):
             raise InputError(
                 f"has no {missing[0]}, and {key[:40]!r} may be it; correct its name, or remove it"
             )
@@ -92,15 +77,25 @@ def _with_frames(trees: list[Tree], cameras: CameraSet) -> Tree:
     return {**trees[0], "frames": frames}
 
 
-NERFSTUDIO = table(
-    _NERF,
-    lambda document: (
+NERFSTUDIO = Format(
+    "nerfstudio",
+    "fl_x,fl_y,cx,cy",
+    """
+    OPENCV, PINHOLE, SIMPLE_PINHOLE, RADIAL, SIMPLE_RADIAL: k1k2p1p2 *
+    OPENCV, PINHOLE, SIMPLE_PINHOLE, RADIAL, SIMPLE_RADIAL: plumb_bob *
+    OPENCV_FISHEYE: fisheye *
+    """,
+    model="camera_model",
+    size="w,h",
+    first_pixel=0.5,
+    optional="any",
+    aside=_ASIDE,
+    told=lambda document: (
         ("fl_x" in document.tree or "camera_angle_x" in document.tree or '"fl_x"' in document.text[:5000])
         and "intrinsics" not in document.tree
     ),
-    "transforms.json of nerfstudio and instant-ngp",
+    files="transforms.json of nerfstudio and instant-ngp",
     parts=_nerf_parts,
-    unit=None,
     views=_nerf_views,
     write=json_text,
     whole=_with_frames,
@@ -108,50 +103,27 @@ NERFSTUDIO = table(
     needs_size=True,
 )
 
-# Nerfies, HyperNeRF and the data of DyCheck.
-_RADIAL = under("radial_distortion/", "0", "1", "2")
-NERFIES = table(
-    CameraKeys(
-        "Nerfies",
-        ("focal_length", "focal_length", "principal_point/0", "principal_point/1"),
-        tuple(
-            Lens(("",), ours, (*_RADIAL[:2], f"{key}/0", f"{key}/1", *_RADIAL[2:count]))
-            for key in ("tangential", "tangential_distortion")  # the older and the newer key
-            for count, ours in ((2, "k1k2p1p2"), (3, "plumb_bob"))
-        ),
-        size=("image_size",),
-        skew="skew",
-        aspect="pixel_aspect_ratio",
-        first_pixel=0.5,
-    ),
-    "orientation position focal_length principal_point",
-    "camera of Nerfies, HyperNeRF, DyCheck: JSON",
-    pose=PoseKeys(("orientation", "position"), centre=True, frame="world"),
-    unit=None,
+# Nerfies, HyperNeRF and the data of DyCheck. The older key of the tangential coefficients is tangential.
+NERFIES = Format(
+    "Nerfies",
+    "focal_length focal_length principal_point/0-1",
+    """
+    k1k2p1p2 radial_distortion/0-1 tangential/0-1
+    plumb_bob radial_distortion/0-1 tangential/0-1 radial_distortion/2
+    k1k2p1p2 radial_distortion/0-1 tangential_distortion/0-1
+    plumb_bob radial_distortion/0-1 tangential_distortion/0-1 radial_distortion/2
+    """,
+    size="image_size",
+    skew="skew",
+    aspect="pixel_aspect_ratio",
+    first_pixel=0.5,
+    told="orientation position focal_length principal_point",
+    files="camera of Nerfies, HyperNeRF, DyCheck: JSON",
+    pose=PoseKeys("orientation position", centre=True, frame="world"),
 )
+
 
 # Gyroflow's lens profiles.
-_GYROFLOW = CameraKeys(
-    "Gyroflow",
-    ("fisheye_params/camera_matrix:matrix",),
-    (Lens(("opencv_fisheye", ""), "fisheye", ("fisheye_params/distortion_coeffs",)),),
-    model="distortion_model",
-    size=("calib_dimension/w", "calib_dimension/h"),
-    name="name",
-)
-
-
-def _gyroflow_parts(document: Document) -> dict[str, Field]:
-    for key in ("input_horizontal_stretch", "input_vertical_stretch"):
-        stretch = document.root.get(key, 1.0).number()
-        if stretch not in (0.0, 1.0):
-            document.notes.append(
-                f"{document.source}: {key} is {stretch:g}; the camera is that of the images which Gyroflow "
-                "stretched"
-            )
-    return {"camera": document.root}
-
-
 def _profile(trees: list[Tree], cameras: CameraSet) -> Tree:
     dimension = trees[0]["calib_dimension"]
     return {
@@ -166,11 +138,17 @@ def _profile(trees: list[Tree], cameras: CameraSet) -> Tree:
     }
 
 
-GYROFLOW = table(
-    _GYROFLOW,
-    "fisheye_params",
-    "lens profile, JSON; mm with `--focal-length` or `--crop-factor`",
-    parts=_gyroflow_parts,
+_STRETCHED = " is {:g}; the camera is that of the images which Gyroflow stretched"
+GYROFLOW = Format(
+    "Gyroflow",
+    "fisheye_params/camera_matrix:matrix",
+    "opencv_fisheye, : fisheye fisheye_params/distortion_coeffs",
+    model="distortion_model",
+    size="calib_dimension/w,h",
+    name="name",
+    told="fisheye_params",
+    files="lens profile, JSON; mm with `--focal-length` or `--crop-factor`",
+    remarks={key: key + _STRETCHED for key in ("input_horizontal_stretch", "input_vertical_stretch")},
     write=json_text,
     whole=_profile,
     needs_size=True,
@@ -178,6 +156,30 @@ GYROFLOW = table(
 
 # lensfun's poly5 is r (1 + k1 r^2 + k2 r^4), from undistorted to distorted radii in half the shorter side of
 # a sensor, which it derives from the diagonal and the ratio of the sides. The centre is in half that side.
+_LENSFUN = """<?xml version="1.0" encoding="UTF-8"?>
+<lensdatabase version="1">
+  <mount>
+    <name>{name}</name>
+  </mount>
+  <camera>
+    <maker>{name}</maker>
+    <model>{name}</model>
+    <mount>{name}</mount>
+    <cropfactor>{crop:.6g}</cropfactor>
+  </camera>
+  <lens>
+    <maker>{name}</maker>
+    <model>{name}</model>
+    <mount>{name}</mount>
+    <cropfactor>{crop:.6g}</cropfactor>
+    <aspect-ratio>{sides}</aspect-ratio>
+    <center x="{x:.9g}" y="{y:.9g}"/>
+    <calibration>
+      <distortion model="poly5" focal="{focal:.6g}"{real} k1="{k1:.12g}" k2="{k2:.12g}"/>
+    </calibration>
+  </lens>
+</lensdatabase>
+"""
 
 
 def _lensfun_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
@@ -187,40 +189,40 @@ def _lensfun_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     camera = cameras.cameras[0]
     width, height = camera.image_size or (0, 0)  # `needs_size`
     longer, shorter = max(width, height), min(width, height)
+    divisor = math.gcd(longer, shorter)
     half = 0.5 * np.hypot(width - 1, height - 1) / np.hypot(longer / shorter, 1)
-    k = [*camera.distortion.coefficients.tolist(), 0.0, 0.0]
+    k1, k2 = np.pad(camera.distortion.coefficients, (0, 2))[:2]
     f, _, _, u0, v0 = camera.entries
     x, y = (float((c - 0.5 * (side - 1)) / (0.5 * (shorter - 1))) for c, side in ((u0, width), (v0, height)))
-    divisor = math.gcd(longer, shorter)
-    name, real = escape(camera.name), "" if true_focal is None else f' real-focal="{true_focal:.6g}"'
-    body = (
-        f"  <mount>\n    <name>{name}</name>\n  </mount>\n"
-        f"  <camera>\n    <maker>{name}</maker>\n    <model>{name}</model>\n    <mount>{name}</mount>\n"
-        f"    <cropfactor>{crop:.6g}</cropfactor>\n  </camera>\n"
-        f"  <lens>\n    <maker>{name}</maker>\n    <model>{name}</model>\n    <mount>{name}</mount>\n"
-        f"    <cropfactor>{crop:.6g}</cropfactor>\n"
-        f"    <aspect-ratio>{longer // divisor}:{shorter // divisor}</aspect-ratio>\n"
-        f'    <center x="{x:.9g}" y="{y:.9g}"/>\n    <calibration>\n'
-        f'      <distortion model="poly5" focal="{focal:.6g}"{real} k1="{k[0] * (half / f) ** 2:.12g}"'
-        f' k2="{k[1] * (half / f) ** 4:.12g}"/>\n    </calibration>\n  </lens>\n'
-    )
     return {
-        "": f'<?xml version="1.0" encoding="UTF-8"?>\n<lensdatabase version="1">\n{body}</lensdatabase>\n'
+        "": _LENSFUN.format(
+            name=escape(camera.name),
+            crop=crop,
+            sides=f"{longer // divisor}:{shorter // divisor}",
+            x=x,
+            y=y,
+            focal=focal,
+            real="" if true_focal is None else f' real-focal="{true_focal:.6g}"',
+            k1=k1 * (half / f) ** 2,
+            k2=k2 * (half / f) ** 4,
+        )
     }
 
 
 LENSFUN = Format(
     "lensfun",
-    ("none", "k1", "k1k2"),
-    _lensfun_text,
+    lenses="""
+    k1 k1
+    k1k2 k1 k2
+    """,
     files="database of one lens, XML, written only; with `--focal-length` or `--crop-factor`",
+    texts=_lensfun_text,
     needs_size=True,
     square=True,
 )
 
+
 # Open3D writes matrices by columns.
-
-
 def _open3d_parts(document: Document) -> dict[str, Field]:
     root = document.root
     inner = root.get("intrinsic", root.value)
@@ -235,13 +237,15 @@ def _by_columns(document: Document) -> bool:
     return flat and m is not None and m[2] == m[5] == 0 and m[8] == 1 and m[6] != 0
 
 
-OPEN3D = table(
-    CameraKeys("Open3D", ("intrinsic_matrix:columns",), (Lens(("",), "none", ()),), size=("width", "height")),
-    _by_columns,
-    "PinholeCameraIntrinsic, PinholeCameraParameters, JSON",
+OPEN3D = Format(
+    "Open3D",
+    "intrinsic_matrix:columns",
+    "none",
+    size="width,height",
+    told=_by_columns,
+    files="PinholeCameraIntrinsic, PinholeCameraParameters, JSON",
     parts=_open3d_parts,
-    pose=PoseKeys(("extrinsic:columns",), frame="world"),
-    unit=None,
+    pose=PoseKeys("extrinsic:columns", frame="world"),
     write=json_text,
     needs_size=True,
 )

@@ -36,10 +36,12 @@ from neurocal_cli.files.exchange import (
     ros,
     sensors,
 )
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, adapt_cameras, after, inverse
+from neurocal_cli.files.exchange.camera_set import CameraSet, adapt_cameras, after, inverse
 from neurocal_cli.files.exchange.corners import read_corners
 from neurocal_cli.files.exchange.document import KALIBR_REPORT, UNKNOWN, Document, NoCameraError
+from neurocal_cli.files.exchange.format_table import Format
 from neurocal_cli.files.exchange.neurocal import camera_set
+from neurocal_cli.files.exchange.tree_paths import in_rows
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.points import Correspondences
 
@@ -49,7 +51,7 @@ _MODULES = (
     photographs, reconstruction, ros, dictionary,
 )  # fmt: skip
 _ALL = [one for module in _MODULES for one in vars(module).values() if isinstance(one, Format)]
-READ = [one for one in _ALL if one.is_read]
+READ = [one for one in _ALL if one.told]
 FORMATS = {one.to: one for one in _ALL if one.is_written}  # by the values of the option ``--to``
 
 # What is known and cannot be read: how it begins, or how to tell it; what it is, and what to do.
@@ -83,7 +85,7 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
     ),
     (
-        lambda d: nearest_lenses.numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
+        lambda d: in_rows(nearest_lenses.LENS, d.text),
         "is the distortion of a camera of OpenPTV, in mm of the sensor; give its .ori, beside this file",
     ),
     (
@@ -238,7 +240,7 @@ def _is_of_cameras(name: str) -> bool:
     with value_failures(document.source):
         of_program = READ[: READ.index(dictionary.OPENCV)]  # which takes any dictionary
         return any(_is(document, sign) for sign, _ in _REFUSED) or any(
-            one.matches is not None and one.matches(document) for one in of_program
+            one.matches(document) for one in of_program
         )
 
 
@@ -338,8 +340,8 @@ def _nearest(document: Document) -> str:
     """The format most of whose keys are in a file that is none, and those that it lacks; "" without any."""
     tree = document.tree
     there = {str(key) for part in (tree, *tree.values()) if isinstance(part, dict) for key in part}
-    one = max(READ, key=lambda one: len(one.marks & there) / max(len(one.marks), 1))
-    own = one.marks - _COMMON
+    one = max(READ, key=lambda one: one.likely * len(one.top & there) / max(len(one.top), 1))
+    own = one.top - _COMMON
     lacks = sorted(own - there)
     if not 0 < len(lacks) <= len(own & there):
         return ""

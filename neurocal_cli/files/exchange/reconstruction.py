@@ -11,30 +11,14 @@ from typing import Any
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import xml_root
-from neurocal_cli.files.exchange.camera_keys import FIVE, K4, CameraKeys, Lens
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
-from neurocal_cli.files.exchange.tree_paths import in_order, under
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.tree_paths import in_rows
 from neurocal_cli.files.tree_fields import Field
+
 
 # Agisoft Metashape: f in pixels, the principal point from the middle of the image, p1 and p2 exchanged. A
 # fisheye has the same polynomial of the angle. Projects hold the same elements for each sensor.
-_BROWN = ("k1", "k2", "p2", "p1", "k3")
-_METASHAPE = CameraKeys(
-    "Metashape",
-    ("fx", "fy", "cx", "cy"),
-    (Lens(("frame",), "plumb_bob", _BROWN), Lens(("fisheye", "equidistant_fisheye"), "fisheye", K4)),
-    model="projection",
-    size=("width", "height"),
-    skew="b2",
-    first_pixel=0.5,
-    from_middle=True,
-    optional="any",
-    aside=("f", "b1", "skew", "date"),
-    complete=True,
-)
-
-
 def _metashape_part(tree: Mapping[str, Any], source: str) -> Field:
     root = Field({"projection": "frame", **tree}, source)
     width, height = root["width"].integer(1), root["height"].integer(1)
@@ -73,50 +57,42 @@ def _metashape_parts(document: Document) -> dict[str, Field]:
 
 
 def _agisoft(tree: Tree) -> str:
-    kind, f = tree.pop("projection"), tree["fy"]
-    entries = {
-        "projection": "frame" if kind == "frame" else "equidistant_fisheye",
-        **{key: tree[key] for key in ("width", "height")},
-        "f": f,
-        **{key: tree[key] for key in ("cx", "cy")},
-        "b1": tree["fx"] - f,
-        "b2": tree["b2"],
-        **{key: tree[key] for key in (*K4, "p1", "p2") if key in tree},
-    }
-    lines = [f"  <{key}>{value!r}</{key}>".replace("'", "") for key, value in entries.items()]
-    body = "\n".join(lines)
+    tree |= {"f": tree["fy"], "b1": tree["fx"] - tree["fy"]}
+    if tree["projection"] != "frame":
+        tree["projection"] = "equidistant_fisheye"
+    order = ("projection", "width", "height", "f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+    body = "\n".join(f"  <{key}>{tree[key]}</{key}>" for key in order if key in tree)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n<calibration>\n{body}\n</calibration>\n'
 
 
-METASHAPE = table(
-    _METASHAPE,
-    lambda document: (
+METASHAPE = Format(
+    "Metashape",
+    "fx,fy,cx,cy",
+    """
+    frame: plumb_bob k1,k2,p2,p1,k3
+    fisheye, equidistant_fisheye: fisheye *
+    """,
+    model="projection",
+    size="width,height",
+    skew="b2",
+    first_pixel=0.5,
+    from_middle=True,
+    optional="any",
+    aside="f b1 skew date",
+    complete=True,
+    told=lambda document: (
         ("<calibration" in document.text[:1000] and "calibration" in document.tree)
         or ("<document" in document.text[:1000] and "<sensor" in document.text)
     ),
-    "Agisoft calibration, doc.xml of a project, or exported cameras: XML",
+    files="Agisoft calibration, doc.xml of a project, or exported cameras: XML",
     parts=_metashape_parts,
     project=True,
     write=_agisoft,
     needs_size=True,
 )
 
+
 # OpenMVG's sfm_data.json. The name of a model stands where it is first used, its number everywhere.
-_OPENMVG = CameraKeys(
-    "OpenMVG",
-    ("focal_length", "focal_length", "principal_point/0", "principal_point/1"),
-    (
-        Lens(("pinhole",), "none", ()),
-        Lens(("pinhole_radial_k1",), "k1", ("disto_k1/0",)),
-        Lens(("pinhole_radial_k3",), "plumb_bob", ("disto_k3/0", "disto_k3/1", "-", "-", "disto_k3/2")),
-        Lens(("pinhole_brown_t2",), "plumb_bob", under("disto_t2/", "0", "1", "3", "4", "2")),
-        Lens(("fisheye",), "fisheye", under("fisheye/", "0", "1", "2", "3")),
-    ),
-    model="model",
-    size=("width", "height"),
-)
-
-
 def _openmvg_parts(document: Document) -> dict[str, Field]:
     names: dict[int, str] = {}
     parts = {}
@@ -130,32 +106,27 @@ def _openmvg_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-OPENMVG = table(
-    _OPENMVG,
-    "sfm_data_version intrinsics",
-    "sfm_data.json",
+OPENMVG = Format(
+    "OpenMVG",
+    "focal_length focal_length principal_point/0,1",
+    """
+    pinhole: none
+    pinhole_radial_k1: k1 disto_k1/0
+    pinhole_radial_k3: plumb_bob disto_k3/0-1 - - disto_k3/2
+    pinhole_brown_t2: plumb_bob disto_t2/0,1,3,4,2
+    fisheye: fisheye fisheye/0-3
+    """,
+    model="model",
+    size="width,height",
+    told="sfm_data_version intrinsics",
+    files="sfm_data.json",
     parts=_openmvg_parts,
     project=True,
 )
 
+
 # AliceVision and Meshroom: texts in place of numbers, the focal length in mm since version 1.2.2, and the
 # principal point from the middle of the image since 1.2.1.
-_D = "distortionParams/"
-_ALICEVISION = CameraKeys(
-    "AliceVision",
-    ("fx", "fy", "cx", "cy"),
-    (
-        Lens(("none", "pinhole", ""), "none", ()),
-        Lens(("radialk1", "radial1"), "k1", (f"{_D}0",)),
-        Lens(("radialk3", "radial3"), "plumb_bob", (f"{_D}0", f"{_D}1", "-", "-", f"{_D}2")),
-        Lens(("brown",), "plumb_bob", under(_D, "0", "1", "3", "4", "2")),
-        Lens(("fisheye4",), "fisheye", under(_D, "0", "1", "2", "3")),
-    ),
-    model="model",
-    size=("size",),
-)
-
-
 def _alicevision_parts(document: Document) -> dict[str, Field]:
     version = document.root["version"].array(3).tolist()
     parts = {}
@@ -177,35 +148,27 @@ def _alicevision_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-ALICEVISION = table(
-    _ALICEVISION,
-    lambda document: (
+ALICEVISION = Format(
+    "AliceVision",
+    "fx,fy,cx,cy",
+    """
+    none, pinhole, : none
+    radialk1, radial1: k1 distortionParams/0
+    radialk3, radial3: plumb_bob distortionParams/0-1 - - distortionParams/2
+    brown: plumb_bob distortionParams/0,1,3,4,2
+    fisheye4: fisheye distortionParams/0-3
+    """,
+    model="model",
+    size="size",
+    told=lambda document: (
         "version" in document.tree and "intrinsicId" in str(document.tree.get("intrinsics"))[:2000]
     ),
-    "cameras.sfm of Meshroom, JSON",
+    files="cameras.sfm of Meshroom, JSON",
     parts=_alicevision_parts,
     project=True,
 )
 
 # OpenSfM and OpenDroneMap: coordinates from the middle of the image, divided by its longer side.
-_ONE = ("focal", "focal", "c_x", "c_y")
-_OPENSFM = CameraKeys(
-    "OpenSfM",
-    ("focal_x", "focal_y", "c_x", "c_y"),
-    (
-        Lens(("perspective",), "k1k2", ("k1", "k2"), _ONE),
-        Lens(("simple_radial",), "k1", ("k1",)),
-        Lens(("radial",), "k1k2", ("k1", "k2")),
-        Lens(("brown",), "plumb_bob", FIVE),
-        Lens(("fisheye",), "fisheye", ("k1", "k2", "-", "-"), _ONE),
-        Lens(("fisheye_opencv",), "fisheye", K4),
-    ),
-    model="projection_type",
-    size=("width", "height"),
-    first_pixel=0.5,
-    from_middle=True,
-    by_longer_side=True,
-)
 _OLD, _CENTRED = {"projection_type": "perspective"}, {"c_x": 0.0, "c_y": 0.0}
 
 
@@ -217,40 +180,47 @@ def _shots(document: Document) -> dict[str, Field]:
     }
 
 
-OPENSFM = table(
-    _OPENSFM,
-    lambda document: (
+OPENSFM = Format(
+    "OpenSfM",
+    "focal_x,focal_y,c_x,c_y",
+    """
+    perspective: k1k2 * of focal,focal,c_x,c_y
+    simple_radial: k1 k1
+    radial: k1k2 *
+    brown: plumb_bob *
+    fisheye: fisheye k1,k2 - - of focal,focal,c_x,c_y
+    fisheye_opencv: fisheye *
+    """,
+    model="projection_type",
+    size="width,height",
+    first_pixel=0.5,
+    from_middle=True,
+    by_longer_side=True,
+    told=lambda document: (
         _shots(document)
         or ({"projection_type", "width", "height"} <= set(document.tree) and "focal" in str(document.tree))
     ),
-    "cameras.json, reference of a camera model; also of OpenDroneMap",
+    files="cameras.json, reference of a camera model; also of OpenDroneMap",
     parts=lambda document: _shots(document) or {"": document.root},
     project=True,
 )
 
 # Pix4D's calibrated_camera_parameters.txt: of each image K, the distortion, and the pose, m = K [R|-Rt] X.
-_PIX4D = CameraKeys(
-    "Pix4D",
-    ("K",),
-    (Lens(("",), "plumb_bob", (*under("radial/", "0", "1"), *under("tangential/", "0", "1"), "radial/2")),),
-    size=("size",),
-)
 _PIX4D_HEAD = re.compile(r"\A\s*fileName imageWidth imageHeight\s.*?\[R\|-Rt\] X\s*\n", re.DOTALL).match
-_PIX4D_ROWS = [3, 3, 3, 3, 3, 2, 3, 3, 3, 3]  # words of a name with its size, and numbers
 
 
 def _pix4d_parts(document: Document) -> dict[str, Field]:
     head = _PIX4D_HEAD(document.text)
-    assert head is not None  # `matches`
-    rows = [line.split() for line in document.text[head.end() :].splitlines() if line.strip()]
-    parts, count = {}, len(_PIX4D_ROWS)
-    for k in range(0, len(rows), count):
-        first, *rest = rows[k : k + count]
-        name = " ".join(first[:-2])
-        if [len(row) for row in rest] != _PIX4D_ROWS[1:] or len(first) < _PIX4D_ROWS[0]:
+    assert head is not None  # `told`
+    lines = [line for line in document.text[head.end() :].splitlines() if line.strip()]
+    parts = {}
+    for k in range(0, len(lines), 10):
+        words = lines[k].split()
+        name, block = " ".join(words[:-2]), "\n".join([" ".join(words[-2:]), *lines[k + 1 : k + 10]])
+        found = in_rows("size:2,K:9/3,radial:3,tangential:2,t:3,R:9/3", block, document.source)
+        if found is None or not name:
             raise InputError(f"the block of the image {name[:40]!r} is damaged; export the file again")
-        words = [*first[-2:], *(word for row in rest for word in row)]
-        parts[name] = in_order("size:2 K:9 radial:3 tangential:2 t:3 R:9", words, document.source)
+        parts[name] = found
     document.warnings.append(
         f"{document.source}: Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
         "which may be half a pixel off"
@@ -258,12 +228,15 @@ def _pix4d_parts(document: Document) -> dict[str, Field]:
     return parts
 
 
-PIX4D = table(
-    _PIX4D,
-    lambda document: _PIX4D_HEAD(document.text[:2000]),
-    "calibrated_camera_parameters.txt",
+PIX4D = Format(
+    "Pix4D",
+    "K",
+    "plumb_bob radial/0-1 tangential/0-1 radial/2",
+    size="size",
+    told=lambda document: _PIX4D_HEAD(document.text[:2000]),
+    files="calibrated_camera_parameters.txt",
     parts=_pix4d_parts,
-    pose=PoseKeys(("R", "t"), centre=True),
+    pose=PoseKeys("R t", centre=True),
     project=True,
     poses=True,
 )

@@ -17,10 +17,9 @@ from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import format_camera_info, matrix_data
+from neurocal_cli.files.exchange import dictionary
 from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.dictionary import KEYS, with_sizes_noted
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import table
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field, is_number
@@ -30,7 +29,7 @@ _RECTIFIED = {"rectification_matrix": 9, "projection_matrix": 12}
 _LABEL = re.compile(r"\s*\[?([A-Za-z][\w /.-]*)\]?\s*").fullmatch
 
 
-def matches(document: Document) -> object:
+def _matches(document: Document) -> object:
     """Whether this is a camera_info file, a message as ``rostopic echo`` prints it, or ost.txt."""
     tree = document.tree
     info = "camera_matrix" in tree and {"rectification_matrix", "projection_matrix"} & set(tree)
@@ -53,7 +52,7 @@ def _parts(document: Document) -> dict[str, Field]:
 
 def _with_rectification(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
     """The camera with its pose in a rectified pair, if the file has one."""
-    found = with_sizes_noted(replace(found, unit="m"), parts, document)
+    found = dictionary.with_sizes_noted(replace(found, unit="m"), parts, document)
     R, P = (np.array(parts["camera"].get(key).value, dtype=float) for key in _RECTIFIED)
     if P.size != 12 or P[0] <= 0 or P[5] <= 0:  # ROS's drivers write zeros where nothing is known
         return found
@@ -114,15 +113,18 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
 
 
-FORMAT = table(
-    replace(KEYS, program="ROS"),
-    matches,
-    "camera_info YAML, a message printed by rostopic echo, ost.txt, ost.ini",
+FORMAT = replace(
+    dictionary.OPENCV,
+    program="ROS",
+    told=_matches,
+    files="camera_info YAML, a message printed by rostopic echo, ost.txt, ost.ini",
     parts=_parts,
+    pose=None,
+    views=None,
     finish=_with_rectification,
-    text=_text,
-    models=("none", "plumb_bob", "rational", "fisheye"),
-    marks=frozenset(),
+    texts=_text,
+    written=("none", "plumb_bob", "rational", "fisheye"),
+    poses=False,
     most_cameras=2,
     metres=True,
     needs_size=True,

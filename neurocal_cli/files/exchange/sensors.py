@@ -7,10 +7,9 @@ from collections.abc import Mapping
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import EIGHT, FIVE, CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import STILL, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import PoseKeys, Tree, table
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import in_order
 from neurocal_cli.files.image_files import read_header
 from neurocal_cli.files.tree_fields import Field
@@ -21,13 +20,6 @@ _ZED_SIZES = {
     "2K": (2208, 1242), "FHD": (1920, 1080), "HD": (1280, 720), "VGA": (672, 376),
     "FHD1200": (1920, 1200), "SVGA": (960, 600), "QHDPLUS": (3200, 1800), "4K": (3840, 2160),
 }  # fmt: skip
-_ZED = CameraKeys(
-    "ZED",
-    ("fx", "fy", "cx", "cy"),
-    (Lens(("",), "plumb_bob", FIVE), Lens(("",), "rational", EIGHT)),
-    size=("size",),
-    optional="any",
-)
 
 
 def _zed_parts(document: Document) -> dict[str, Field]:
@@ -39,40 +31,33 @@ def _zed_parts(document: Document) -> dict[str, Field]:
         raise InputError(f"holds cameras of several image sizes; convert one with --image-size: {sizes}")
     (mode,) = fitting
     stereo = root["STEREO"]
-    pose = {
+    common = {
         "r": [stereo.get(f"{key}_{mode}", 0.0).number() for key in ("RX", "CV", "RZ")],
         "T": [-stereo["Baseline"].number(), *(-stereo.get(key, 0.0).number() for key in ("TY", "TZ"))],
+        "size": list(_ZED_SIZES.get(mode, (0, 0))),
     }
-    return {
-        side.lower(): Field(
-            {**root[f"{side}_CAM_{mode}"].value, **pose, "size": list(_ZED_SIZES.get(mode, (0, 0)))},
-            root.source,
-            f"{side}_CAM_{mode}",
-        )
-        for side in ("LEFT", "RIGHT")
-    }
+    keys = {side.lower(): f"{side}_CAM_{mode}" for side in ("LEFT", "RIGHT")}
+    return {side: Field({**root[key].value, **common}, root.source, key) for side, key in keys.items()}
 
 
-ZED = table(
-    _ZED,
-    lambda document: any(str(key).startswith("LEFT_CAM_") for key in document.tree),
-    "SN*.conf of Stereolabs",
+ZED = Format(
+    "ZED",
+    "fx,fy,cx,cy",
+    """
+    plumb_bob *
+    rational *
+    """,
+    size="size",
+    optional="any",
+    told=lambda document: any(str(key).startswith("LEFT_CAM_") for key in document.tree),
+    files="SN*.conf of Stereolabs",
     parts=_zed_parts,
-    pose=PoseKeys(("r", "T"), from_first=True),
+    pose=PoseKeys("r T", from_first=True),
     unit="mm",
     rig="R of the vector (RX, CV, RZ), T = -(Baseline, TY, TZ)",
 )
 
 # RealSense, as rs-enumerate-devices -c lists its streams, and as Python prints intrinsics.
-_REALSENSE = CameraKeys(
-    "RealSense",
-    ("fx", "fy", "cx", "cy"),
-    (Lens(("None", "Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady"), "plumb_bob", ("D",)),
-     Lens(("Kannala Brandt4",), "fisheye", ("D",))),
-    model="model",
-    size=("size",),
-    name="name",
-)  # fmt: skip
 _STREAM = re.compile(
     r'Intrinsics? of "(?P<name>[^"]+)" / *[^\n]*\n\s*Width:\s*(?P<w>\d+)\s*Height:\s*(?P<h>\d+)'
     r"\s*PPX:\s*(?P<cx>\S+)\s*PPY:\s*(?P<cy>\S+)\s*Fx:\s*(?P<fx>\S+)\s*Fy:\s*(?P<fy>\S+)\s*Distortion:\s*"
@@ -100,33 +85,31 @@ def _realsense_parts(document: Document) -> dict[str, Tree]:
                 f"the model {found['model']} of RealSense is not known here; calibrate its images, or use "
                 "streams that the camera undistorts"
             )
-        values = {key: found[key] for key in ("fx", "fy", "cx", "cy", "model")}
-        name = found.groupdict().get("name") or "camera"
-        tree = {**values, "D": k.tolist(), "size": size, "name": name}
-        parts[f"{name} {size[0]}x{size[1]}"] = tree
+        tree = {"name": "camera", **found.groupdict(), "D": k.tolist(), "size": size}
+        parts["{name} {w}x{h}".format(**tree)] = tree
     return parts
 
 
-REALSENSE = table(
-    _REALSENSE,
-    _streams,
-    "list of rs-enumerate-devices -c, and Python's text of intrinsics",
+REALSENSE = Format(
+    "RealSense",
+    "fx,fy,cx,cy",
+    """
+    None, Brown Conrady, Modified Brown Conrady, Inverse Brown Conrady: plumb_bob D
+    Kannala Brandt4: fisheye D
+    """,
+    model="model",
+    size="size",
+    name="name",
+    aside="w h k",
+    told=_streams,
+    files="list of rs-enumerate-devices -c, and Python's text of intrinsics",
     parts=_realsense_parts,
     project=True,
 )
 
 # DepthAI's boards: a socket and its camera in turn, lengths in cm. The extrinsics map a camera's frame to
 # that of another socket, in a tree whose root names none.
-_OAK = CameraKeys(
-    "OAK",
-    ("intrinsicMatrix:matrix",),
-    (Lens(("0",), "tilted", ("distortionCoeff",)), Lens(("1",), "fisheye", ("distortionCoeff",))),
-    model="cameraType",
-    size=("width", "height"),
-)
-
-
-_TO_SOCKET = PoseKeys(("extrinsics/rotationMatrix", "extrinsics/translation/x,y,z"))
+_TO_SOCKET = PoseKeys("extrinsics/rotationMatrix extrinsics/translation/x,y,z")
 
 
 def _oak_parts(document: Document) -> dict[str, Field]:
@@ -153,14 +136,20 @@ def _oak_poses(parts: Mapping[str, Field]) -> list[Pose | None]:
     return [poses.get(sockets[name]) for name in parts]
 
 
-OAK = table(
-    _OAK,
-    "cameraData boardName",
-    "calibration of DepthAI's boards, JSON",
+OAK = Format(
+    "OAK",
+    "intrinsicMatrix:matrix",
+    """
+    0: tilted distortionCoeff
+    1: fisheye distortionCoeff
+    """,
+    model="cameraType",
+    size="width,height",
+    told="cameraData boardName",
+    files="calibration of DepthAI's boards, JSON",
     parts=_oak_parts,
     pose=_oak_poses,
     unit="cm",
-    most_cameras=99,
     rig="`extrinsics` to the socket `toCameraSocket`, in cm",
 )
 
@@ -173,13 +162,6 @@ _KINECT_MODES = {
     (640, 576): ((1024, 1024), (192, 180)), (320, 288): ((512, 512), (96, 90)),
     (512, 512): ((512, 512), (0, 0)), (1024, 1024): ((1024, 1024), (0, 0)),
 }  # fmt: skip
-_KINECT = CameraKeys(
-    "Azure Kinect",
-    ("fx", "fy", "cx", "cy"),
-    (Lens(("",), "rational", EIGHT),),
-    size=("size",),
-    first_pixel=0.5,
-)
 _KINECT_ORDER = "cx cy fx fy k1 k2 k3 k4 k5 k6 codx cody p2 p1 rest:"
 
 
@@ -208,23 +190,19 @@ def _kinect_parts(document: Document) -> dict[str, Tree]:
     raise InputError(f"holds no camera of the purpose {purpose}; give another --image-size")
 
 
-KINECT = table(
-    _KINECT,
-    "CalibrationInformation",
-    "raw calibration, JSON, with `--image-size`",
+KINECT = Format(
+    "Azure Kinect",
+    "fx,fy,cx,cy",
+    "rational *",
+    size="size",
+    first_pixel=0.5,
+    told="CalibrationInformation",
+    files="raw calibration, JSON, with `--image-size`",
     parts=_kinect_parts,
 )
 
 # DJI's DewarpData, in the XMP of a photograph or as exiftool prints it: a date; fx, fy, the principal point
 # from the middle of the image, and k1, k2, p1, p2, k3. The size is that of the photograph.
-_DJI = CameraKeys(
-    "DJI",
-    ("fx", "fy", "cx", "cy"),
-    (Lens(("",), "plumb_bob", FIVE),),
-    size=("size",),
-    first_pixel=0.5,
-    from_middle=True,
-)
 _DEWARP = re.compile(rb"Dewarp ?Data\s*[=:>]\s*[\"']?(?:[-\d]+;)?((?:\s*[-+.\deE]+,){8}\s*[-+.\deE]+)")
 _XMP_BYTES = 300_000  # of a photograph, in which its XMP stands
 
@@ -235,7 +213,7 @@ def _dewarp(document: Document) -> re.Match[bytes] | None:
 
 def _dji_parts(document: Document) -> dict[str, Field]:
     found = _dewarp(document)
-    assert found is not None  # `matches`
+    assert found is not None  # `told`
     size = document.size
     if not document.is_text:
         header = read_header(document.data, document.source)
@@ -246,9 +224,14 @@ def _dji_parts(document: Document) -> dict[str, Field]:
     return {"camera": in_order("size:2 fx fy cx cy k1 k2 p1 p2 k3", words, document.source)}
 
 
-DJI = table(
-    _DJI,
-    _dewarp,
-    "photographs with DewarpData, or its text with `--image-size`",
+DJI = Format(
+    "DJI",
+    "fx,fy,cx,cy",
+    "plumb_bob *",
+    size="size",
+    first_pixel=0.5,
+    from_middle=True,
+    told=_dewarp,
+    files="photographs with DewarpData, or its text with `--image-size`",
     parts=_dji_parts,
 )

@@ -9,6 +9,7 @@ columns are ``transposed``, a nested matrix, and ``columns``, one list, and so t
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,12 +21,9 @@ from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import flow, number, text
 
+_LONGEST = 5000  # characters of a text of numbers in rows
+_RANGE = re.compile(r"(.*?)(\d+)-(\d+)").fullmatch
 _BY_COLUMNS = ("transposed", "columns")
-
-
-def under(prefix: str, *names: str) -> tuple[str, ...]:
-    """Paths of names that begin alike."""
-    return tuple(prefix + name for name in names)
 
 
 def find(root: Field, path: str) -> Field | None:
@@ -56,6 +54,17 @@ def split(path: str) -> list[str]:
     """The paths of each number, of one that ends in several keys; the path alone without."""
     folder, _, keys = path.partition(":")[0].rpartition("/")
     return [f"{folder}/{key}" if folder else key for key in keys.split(",")]
+
+
+def listed(paths: str) -> list[str]:
+    """The paths in a text, each of one number unless there is but one; ``k1-3`` are k1, k2 and k3."""
+    found: list[str] = []
+    for path in paths.split():
+        if (ends := _RANGE(path)) is not None:
+            found += [f"{ends[1]}{k}" for k in range(int(ends[2]), int(ends[3]) + 1)]
+        else:
+            found += split(path) if "," in path else [path]
+    return found
 
 
 def numbers_at(root: Field, path: str) -> Array:
@@ -109,6 +118,25 @@ def in_order(table: str, words: Any, source: str) -> Field:
     if values:
         raise FormatError(f"holds {len(values)} numbers too many; write it again", source)
     return Field(tree, source)
+
+
+def in_rows(table: str, text: str, source: str = "") -> Field | None:
+    """The tree of a text of numbers in fixed rows, perhaps with comments after ``#``; None for others.
+
+    A table is that of `in_order` with commas between the rows; ``R:9/3`` are nine numbers in three rows.
+    """
+    rows = [line.split() for line in text[:_LONGEST].splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    tree: dict[str, Any] = {}
+    for part in table.split(","):
+        entries, _, count = part.partition("/")
+        own, rows = rows[: int(count or 1)], rows[int(count or 1) :]
+        if len(set(map(len, own))) != 1:
+            return None
+        try:
+            tree |= in_order(entries, [word for row in own for word in row], source).value
+        except FormatError:
+            return None
+    return None if rows else Field(tree, source)
 
 
 def arrays(tree: Mapping[str, Any]) -> dict[str, Any]:
