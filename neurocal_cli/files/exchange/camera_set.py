@@ -194,9 +194,9 @@ def adapt_cameras(
     cannot represent the distortion model (unless `force` accepts the nearest one of another model), the
     number of cameras, or an unknown unit or image size.
     """
-    if len(cameras.cameras) > target.most:
+    if len(cameras.cameras) > target.most_cameras:
         raise InputError(
-            f"a file of {target.program} holds {plural(target.most, 'camera')} at most, and there "
+            f"a file of {target.program} holds {plural(target.most_cameras, 'camera')} at most, and there "
             f"are {len(cameras.cameras)}; write another format"
         )
     if target.needs_size and any(camera.image_size is None for camera in cameras.cameras):

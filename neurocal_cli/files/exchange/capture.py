@@ -171,5 +171,5 @@ DLT = Format(
     texts=_dlt_text,
     has_skew=True,
     poses=True,
-    most_cameras=99,
+    at_most=99,
 )

@@ -317,7 +317,7 @@ FORMAT = replace(
     project=False,
     texts=_text,
     poses=True,
-    most_cameras=99,
+    at_most=99,
     needs_size=True,
     rig="`rigs.txt`, from the first camera",
 )

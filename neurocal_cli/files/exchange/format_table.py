@@ -143,7 +143,7 @@ class Format(CameraKeys):
     likely: bool = True  # whether files that are no camera may be like it by their keys
     has_skew: bool = False  # whether its programs support skew, if no key tells it
     poses: bool = False  # whether it contains the poses of views
-    most_cameras: int | None = None  # one, or any number of a rig, if it is not told
+    at_most: int | None = None  # cameras: if it is not told, one, or any number of a rig
     metres: bool = False  # whether lengths are in metres
     needs_size: bool = False  # whether the image size must be known
     rectified: bool = False  # whether it contains the rectification of a camera
@@ -166,10 +166,10 @@ class Format(CameraKeys):
         return self.has_skew or bool(self.skew)
 
     @property
-    def most(self) -> int:
+    def most_cameras(self) -> int:
         """How many cameras a file holds at most."""
         pair = isinstance(self.pose, PoseKeys) and self.pose.from_first
-        return self.most_cameras or (2 if pair else 99 if self.rig else 1)
+        return self.at_most or (2 if pair else 99 if self.rig else 1)
 
     @property
     def is_written(self) -> bool:
@@ -245,7 +245,7 @@ class Format(CameraKeys):
             return self.texts(cameras, ending)
         assert self.write is not None
         trees = [self.tree(camera) for camera in cameras.cameras]
-        if isinstance(self.pose, PoseKeys) and self.most > 1:
+        if isinstance(self.pose, PoseKeys) and self.most_cameras > 1:
             start = int(self.pose.from_first)
             for tree, placed in zip(trees[start:], cameras.mounted[start:], strict=True):
                 self.pose.put(tree, placed)

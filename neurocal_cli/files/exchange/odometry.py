@@ -75,7 +75,7 @@ ORB_SLAM = replace(
     pose=PoseKeys("Stereo.T_c1_c2", back=True, from_first=True),
     write=_storage,
     whole=lambda trees, cameras: {f"Camera.{key}": value for key, value in trees[0].items()},
-    most_cameras=1,
+    at_most=1,
     metres=True,
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
 )
@@ -122,7 +122,7 @@ EUROC = Format(
     files="sensor.yaml of the EuRoC data set",
     parts=_euroc_parts,
     pose=PoseKeys("T_BS", back=True),
-    most_cameras=1,
+    at_most=1,
     metres=True,
     write=yaml_text,
     needs_size=True,
