@@ -255,7 +255,7 @@ def _write_cameras(
     cameras: CameraSet, target: str, model: str | None, force: bool, output: str
 ) -> dict[str, Any]:
     """Write cameras; return the summary for programs."""
-    from neurocal_cli.files.exchange.camera_set import adapt_cameras
+    from neurocal_cli.files.exchange.adaptation import adapt_cameras
     from neurocal_cli.files.exchange.reading import FORMATS
 
     wanted = FORMATS[target]

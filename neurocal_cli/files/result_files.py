@@ -51,7 +51,7 @@ def write_result(
     ending = os.path.splitext(str(path))[1].lower()
     # Modules of other formats are imported only if they are needed.
     if ending == ".xml":
-        from neurocal_cli.files.exchange.camera_set import adapt_cameras
+        from neurocal_cli.files.exchange.adaptation import adapt_cameras
         from neurocal_cli.files.exchange.dictionary import OPENCV
         from neurocal_cli.files.exchange.neurocal import camera_set
 

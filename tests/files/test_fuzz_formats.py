@@ -20,7 +20,8 @@ from neurocal_cli import Camera, Intrinsics, Pose
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.files.exchange.camera_set import CameraSet, adapt_cameras
+from neurocal_cli.files.exchange.adaptation import adapt_cameras
+from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.corners import read_corners
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
 

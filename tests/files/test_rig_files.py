@@ -89,8 +89,8 @@ def test_wrong_files_are_refused(rig: Rig, tmp_path: Path, old: str, new: str, s
 
 @pytest.mark.parametrize("program", ["kalibr", "colmap", "mrcal"])
 def test_other_programs_get_the_same_projections(rig: Rig, tmp_path: Path, program: str) -> None:
+    from neurocal_cli.files.exchange.adaptation import adapt_cameras
     from neurocal_cli.files.exchange.calibrators import KALIBR, MRCAL
-    from neurocal_cli.files.exchange.camera_set import adapt_cameras
     from neurocal_cli.files.exchange.colmap import FORMAT as COLMAP
     from neurocal_cli.files.exchange.neurocal import camera_set
 

@@ -36,7 +36,8 @@ from neurocal_cli.files.exchange import (
     ros,
     sensors,
 )
-from neurocal_cli.files.exchange.camera_set import CameraSet, adapt_cameras, after, inverse
+from neurocal_cli.files.exchange.adaptation import adapt_cameras
+from neurocal_cli.files.exchange.camera_set import CameraSet, after, inverse
 from neurocal_cli.files.exchange.corners import read_corners
 from neurocal_cli.files.exchange.document import KALIBR_REPORT, UNKNOWN, Document, NoCameraError
 from neurocal_cli.files.exchange.format_table import Format
