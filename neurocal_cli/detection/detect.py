@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import fitted_ellipses, nearly_elliptic
+from neurocal_cli.detection.circles.lattice import dark_ellipses
 from neurocal_cli.detection.circles.measuring import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grey import grey_image, negative
@@ -258,11 +258,8 @@ _SMALLEST = 0.05  # least perimeter of a marker, in longer sides of the image; i
 _WINDOW = 23  # px of the adaptive threshold; one window is fast, and enough to find a few markers
 _FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
 _CIRCLES = 16
-_OUTLINE = 16  # px, least length of an outline
-_ELLIPTIC = 0.05  # deviation from an ellipse over its radius; that of a square is 0.1
 _EVEN = 0.5  # greatest spread of the distances between neighbours over their median
 _ALIKE = 1.0  # greatest logarithm of an area over the median area
-_SHARP = 1.25  # greatest ratio of areas at two brightness levels; a blurred square may look like a circle
 
 
 def other_target(grey: NDArray[np.generic]) -> str:
@@ -273,7 +270,7 @@ def other_target(grey: NDArray[np.generic]) -> str:
             "the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; leave out --cols and "
             "--rows, so that the board is found, or describe it by --board, for example charuco:8x6:28:21"
         )
-    if small.size >= _CIRCLES * _OUTLINE and (_shows_circles(small) or _shows_circles(255 - small)):
+    if _shows_circles(small) or _shows_circles(255 - small):
         return (
             "the image shows a grid of circles, no chessboard; leave out --cols and --rows, so that the "
             "board is found, or describe it by --board, for example circles:7x6:20"
@@ -313,42 +310,31 @@ def _shows_markers(grey: NDArray[np.uint8]) -> bool:
 
 
 def _shows_circles(image: NDArray[np.uint8]) -> bool:
-    """Whether an image shows enough dark ellipses of similar size, evenly spaced and sharp."""
-    level, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    found = _ellipses(image, level)
+    """Whether an image shows enough dark ellipses of similar size, evenly spaced.
+
+    Blurred squares look like ellipses, too, but not at three levels of brightness.
+    """
+    middle, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    found = _ellipses(image, middle)
     if len(found) < _CIRCLES:
         return False
-    darkest, brightest = np.quantile(image, [0.02, 0.98])
-    apart = np.hypot(*(found[:, None, :2] - found[None, :, :2]).T)
+    apart = _apart(found, found)
     np.fill_diagonal(apart, np.inf)
-    low, middle, high = np.quantile(apart.min(axis=1), [0.1, 0.5, 0.9])
-    if high - low > _EVEN * middle:
-        return False
-    near = 0.2 * middle
-    inner = _matched(found, _ellipses(image, 0.5 * (level + darkest)), near)
-    outer = _matched(found, _ellipses(image, 0.5 * (level + brightest)), near)
-    both = np.isfinite(inner) & np.isfinite(outer)
-    if np.count_nonzero(both) < _CIRCLES:
-        return False
-    return float(np.median(outer[both] / inner[both])) < _SHARP
+    low, usual, high = np.quantile(apart.min(axis=1), [0.1, 0.5, 0.9])
+    others = (_ellipses(image, 0.5 * (middle + end)) for end in np.quantile(image, [0.02, 0.98]))
+    return high - low <= _EVEN * usual and all(
+        np.count_nonzero(_apart(found, one).min(axis=1, initial=np.inf) < 0.2 * usual) >= _CIRCLES
+        for one in others
+    )
 
 
-def _matched(found: NDArray[np.float64], others: NDArray[np.float64], near: float) -> NDArray[np.float64]:
-    """(n,) area of the other ellipse at the same place as each ellipse; nan if there is none."""
-    if not len(others):
-        return np.full(len(found), np.nan)
-    apart = np.hypot(*(found[:, None, :2] - others[None, :, :2]).T).T
-    return np.where(apart.min(axis=1) < near, others[apart.argmin(axis=1), 2], np.nan)
+def _ellipses(image: NDArray[np.uint8], level: float) -> Array:
+    """Centres (n, 2) of the dark ellipses of about the median size."""
+    area, *centre = dark_ellipses(image, level).T
+    usual = np.median(area) if len(area) else 1.0
+    return np.stack(centre, axis=1)[np.abs(np.log(area / usual)) < _ALIKE]
 
 
-def _ellipses(image: NDArray[np.uint8], level: float) -> NDArray[np.float64]:
-    """(n, 3) centres and areas of the dark ellipses of about the median size."""
-    outlines, _ = cv2.findContours((image < level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    long = nearly_elliptic([np.asarray(outline)[:, 0] for outline in outlines if len(outline) >= _OUTLINE])
-    if not long:
-        return np.zeros((0, 3))
-    centre, _, away = fitted_ellipses(long)
-    good = np.flatnonzero(away < _ELLIPTIC)
-    ellipses = np.column_stack([centre[good], [cv2.contourArea(long[k]) for k in good]])
-    usual = np.median(ellipses[:, 2]) if len(ellipses) else 0.0
-    return ellipses[np.abs(np.log(np.maximum(ellipses[:, 2], 1e-9) / max(usual, 1e-9))) < _ALIKE]
+def _apart(first: Array, second: Array) -> Array:
+    """(n, m) distances."""
+    return np.asarray(np.hypot(*(first[:, None] - second).transpose(2, 0, 1)))

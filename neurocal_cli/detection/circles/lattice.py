@@ -37,7 +37,6 @@ _NEIGHBOURS = 8  # saddle points near each other where small circles are looked 
 _ROUND, _ROUND_PX = 0.04, 0.5  # deviation from an ellipse over its radius, and px of it
 _THIN = 0.1  # least ratio of the axes
 _COMPACT = 0.02  # least area over the squared length of an outline; 0.02 of the thinnest ellipse
-_UNEVEN = 0.08  # further deviation that a rough ellipse, through the outline's moments, may have
 _OUTSIDE = 1.25  # radii, where it is lighter
 _SAME = 0.5  # radii of the smaller one between centres of the same blob
 
@@ -90,10 +89,7 @@ def _all_ellipses(grey: NDArray[np.uint8], longest: int) -> Array:
         window = 2 * round(0.5 * share * longest) + 3
         mean = cv2.blur(smooth, (window, window))
         for step in _STEPS:
-            dark = (smooth < np.maximum(mean, step) - np.uint8(step)).view(np.uint8)
-            outlines, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-            compact = (x for x in outlines if len(x) >= _SHORTEST and _is_compact(x))
-            found.append(_ellipses([np.asarray(x)[:, 0] for x in compact], smooth))
+            found.append(dark_ellipses(smooth, np.maximum(mean, step) - np.uint8(step)))
     return np.concatenate(found)
 
 
@@ -118,68 +114,54 @@ def _distinct(looks: list[Array]) -> Blobs:
     return Blobs(every[kept, 1:3], every[kept, 0])
 
 
-def _ellipses(outlines: list[NDArray[Any]], image: NDArray[Any]) -> Array:
-    """Areas and centres (N, 3) of the outlines (n, 2) that are ellipses and darker than what is around."""
-    outlines = nearly_elliptic(outlines)
+def dark_ellipses(image: NDArray[Any], level: NDArray[Any] | float) -> Array:
+    """Areas and centres (N, 3) of the parts of an image below a level that are ellipses.
+
+    They are darker than what is around them. The ellipses have the moments of what the outlines enclose.
+    """
+    dark = (image < level).view(np.uint8)
+    every, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    outlines = [np.asarray(x)[:, 0] for x in every if len(x) >= _SHORTEST and _is_compact(x)]
     if not outlines:
         return np.zeros((0, 3))
-    centre, axes, away = fitted_ellipses(outlines)
-    low, high = axes.min(axis=1), axes.max(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        good = (low > _THIN * high) & (away <= _ROUND + _ROUND_PX / low)
-    area = np.pi * (axes + 1).prod(axis=1) / 4  # the outline runs through the outermost dark pixels
-    # An arc does not enclose what its ellipse does.
-    share = np.array([cv2.contourArea(one) + len(one) / 2 for one in outlines]) / area
-    good &= (share > 0.7) & (share < 1.3)
-    round_ones = np.flatnonzero(good)
-    kept = round_ones[_darker([outlines[k] for k in round_ones], centre[round_ones], image)]
-    return np.column_stack([area, centre])[kept]
-
-
-def fitted_ellipses(outlines: list[NDArray[Any]]) -> tuple[Array, Array, Array]:
-    """Centres (n, 2) and axes (n, 2) [px] of ellipses through outlines, and how far (n,) these are from them.
-
-    That is the standard deviation over the radius or, if it is larger, the mean.
-    """
-    fitted = np.array([(*at, *axes, turn) for at, axes, turn in map(cv2.fitEllipse, outlines)])
-    centre, axes, turn = fitted[:, :2], fitted[:, 2:4], np.radians(fitted[:, 4:])
-    of, points = _joined(outlines)
-    away = points - centre[of]
-    along = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)[of]
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        radius = np.hypot(*(2 * (away * x).sum(axis=1) / axes[of, k] for k, x in enumerate((along, across))))
-        mean, spread = _mean_and_spread(of, radius)
-    return centre, axes, np.maximum(np.abs(mean - 1), spread)
-
-
-def nearly_elliptic(outlines: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Leave out outlines whose moments are not those of ellipses, which is faster than fitting one."""
-    if not outlines:
-        return outlines
     of, points = _joined(outlines)
     count = np.bincount(of)
-    u, v = (x - (np.bincount(of, x) / count)[of] for x in points.T)
-    uu, uv, vv = (np.bincount(of, x) / count for x in (u * u, u * v, v * v))
-    least = 0.5 * (uu + vv) - np.hypot(0.5 * (uu - vv), uv)
+    middle = np.stack([np.bincount(of, x) / count for x in points.T], axis=1)
+    (u, v), last = (points - middle[of]).T, np.cumsum(count) - 1
+    u_next, v_next = np.roll(u, -1), np.roll(v, -1)
+    u_next[last], v_next[last] = u[last - count + 1], v[last - count + 1]
+    turn = u * v_next - u_next * v  # twice the area of the triangle with the middle
+
+    def moment(of_edges: Array) -> Array:
+        return np.bincount(of, of_edges * turn).astype(float)
+
     with np.errstate(divide="ignore", invalid="ignore"):
+        enclosed = 0.5 * moment(np.ones(len(u)))
+        mean_u, mean_v = moment(u + u_next) / (6 * enclosed), moment(v + v_next) / (6 * enclosed)
+        uu = moment(u * u + u * u_next + u_next * u_next) / (12 * enclosed) - mean_u**2
+        vv = moment(v * v + v * v_next + v_next * v_next) / (12 * enclosed) - mean_v**2
+        uv = moment((u + u_next) * (v + v_next) + u * v + u_next * v_next) / (24 * enclosed) - mean_u * mean_v
+        u, v = u - mean_u[of], v - mean_v[of]
         square = (vv[of] * u * u - 2 * uv[of] * u * v + uu[of] * v * v) / (uu * vv - uv * uv)[of]
-        mean, spread = _mean_and_spread(of, np.sqrt(np.maximum(square, 0)))
-        even = spread <= mean * (_ROUND + _ROUND_PX / np.sqrt(8 * least) + _UNEVEN)
-    return [outlines[k] for k in np.flatnonzero(even & (least > 0))]
+        radius = 0.5 * np.sqrt(np.maximum(square, 0))
+        mean = np.bincount(of, radius) / count
+        spread = np.sqrt(np.bincount(of, (radius - mean[of]) ** 2) / count)
+        half, differ = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+        low, high = 4 * np.sqrt(half - differ), 4 * np.sqrt(half + differ)
+        good = (low > _THIN * high) & (np.maximum(np.abs(mean - 1), spread) <= _ROUND + _ROUND_PX / low)
+        area = np.pi * (low + 1) * (high + 1) / 4  # the outline runs through the outermost dark pixels
+        # An arc does not enclose what its ellipse does.
+        share = (np.abs(enclosed) + count / 2) / area
+    good &= (share > 0.7) & (share < 1.3)
+    centre, round_ones = middle + np.stack([mean_u, mean_v], axis=1), np.flatnonzero(good)
+    kept = round_ones[_darker([outlines[k] for k in round_ones], centre[round_ones], image)]
+    return np.column_stack([area, centre])[kept]
 
 
 def _joined(outlines: list[NDArray[Any]]) -> tuple[NDArray[np.intp], Array]:
     """The outline (P,) of each of all points, and the points (P, 2)."""
     of = np.repeat(np.arange(len(outlines)), list(map(len, outlines)))
     return of, np.concatenate(outlines).astype(float)
-
-
-def _mean_and_spread(of: NDArray[np.intp], values: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation of the values of each outline."""
-    count = np.bincount(of)
-    mean = np.bincount(of, values) / count
-    return mean, np.sqrt(np.bincount(of, (values - mean[of]) ** 2) / count)
 
 
 def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) -> NDArray[np.bool_]:
