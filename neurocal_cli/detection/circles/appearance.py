@@ -79,7 +79,10 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     signed = np.sqrt(max(inside**2 - around**2, 0.0))
     step = abs(profile[outer] - profile[inner])
     blur = _STEP * radius * step / max(np.sqrt(2 * np.pi) * np.abs(np.diff(profile)).max(), 1e-9)
-    blank = rings[half] + _BLUR * blur
+    # The light is half-way between this ring and the next one.
+    level, after = mean[[half, min(half + 1, len(mean) - 1)]].mean(axis=1)
+    between = (0.5 - level) / max(after - level, 0.5 - level, 1e-9)
+    blank = rings[half] + between * _STEP * radius + _BLUR * blur
     paper = (rings > blank) & (rings < apart - blank)
     at = places[:, None, None] + shift[paper]
     within = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
