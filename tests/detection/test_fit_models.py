@@ -94,7 +94,7 @@ def some_edges() -> tuple[EdgePixels, Array, ProfileShape]:
     value, gain, Q, R = (
         rng.uniform(low, high, (E, N)) for low, high in ((20, 230), (0.9, 1.1), (0.5, 1), (-0.5, 0.5))
     )
-    data = EdgePixels(value, gain, Q, np.ones((E, N)), np.zeros(E), s / 15, d, R)  # type: ignore[arg-type]
+    data = EdgePixels(value, gain, Q, np.ones((E, N)), s / 15, d, R)  # type: ignore[arg-type]
     values = np.column_stack(
         [
             rng.normal(0, 0.3, E),
@@ -150,7 +150,7 @@ def some_vertices() -> tuple[VertexPixels, Array, ProfileShape]:
     value, gain, Q = rng.uniform(20, 230, (V, N)), rng.uniform(0.9, 1.1, (V, N)), rng.choice([-1, 1], (V, N))
     rho = np.array([[0.0], [0.3], [-0.9]])
     relative = np.array([[1.0, 1.0], [0.9, 1.1], [1.1, 0.9]])
-    arrays = (value, gain, Q, np.ones((V, N)), np.zeros(V), s1 / 3, d1, s2 / 3, d2, rho, relative)
+    arrays = (value, gain, Q, np.ones((V, N)), s1 / 3, d1, s2 / 3, d2, rho, relative)
     data = VertexPixels(*arrays)  # type: ignore[arg-type]
     places = rng.normal(0, 0.2, (V, 4))
     values = np.column_stack([places, np.full(V, 120.0), np.full(V, 90.0), rng.uniform(0.6, 1.2, V)])
@@ -190,7 +190,7 @@ def test_blurred_oblique_cross_is_as_modelled(angle: float, motion: float) -> No
     blur = np.sqrt([[a @ S @ a, b @ S @ b]])
     rho = np.array([[a @ S @ b]]) / blur.prod()
     relative = blur / blur.mean()
-    data = VertexPixels(zero, one, one, one, np.zeros(1), zero, d1, zero, d2, rho, relative)  # type: ignore[arg-type]
+    data = VertexPixels(zero, one, one, one, zero, d1, zero, d2, rho, relative)  # type: ignore[arg-type]
     values = np.array([[0, 0, 0, 0, 0, 1, blur.mean()]])
     shape = ProfileShape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
     linear = vertex_model(data, values, shape)

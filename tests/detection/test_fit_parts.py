@@ -84,7 +84,7 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     nothing = np.zeros((60, 1), dtype=np.float32)
     linear = Linearised(rows_for(60, 5, 1, nothing.dtype), nothing, nothing)
     ones = np.ones(60)
-    pixels = FitPixels(nothing, nothing, nothing, nothing, ones)
+    pixels = FitPixels(nothing, nothing, nothing, nothing)
     shape = ProfileShape(np.zeros((60, 2)), np.zeros(1))
     fit = BatchFit(values, information, prior, ones, lambda *_: linear, pixels, shape, ones, linear)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
@@ -102,7 +102,7 @@ def test_fits_settle_where_their_steps_are_too_long() -> None:
         return Linearised(rows, rows[:, 0], rows[:, 0])
 
     one = np.ones((20, 1), dtype=np.float32)
-    pixels = FitPixels(one, one, one, one, np.zeros(20))
+    pixels = FitPixels(one, one, one, one)
     shape = ProfileShape(np.zeros((20, 2)), np.zeros(1))
     start = np.array([[0.3, 0, 1, 5.0]] * 19 + [[4.0, 0, 1, 5.0]])
     prior = LevelPrior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
@@ -179,15 +179,18 @@ def test_strips_hold_every_pixel_once(angle: float) -> None:
     d = du * lines.normal[0, 0] + dv * lines.normal[0, 1]
     expected = image[(np.abs(d) <= 4) & (np.abs(s) <= 10 - 1.5)]
     np.testing.assert_array_equal(np.sort(strips.value[strips.inside]), expected)
-    assert strips.beyond[0] == 0
 
 
-def test_strips_know_what_lies_outside_the_image() -> None:
+def test_strips_hold_no_pixels_outside_the_image() -> None:
     image = np.zeros((90, 100), dtype=np.uint8)
     lines = grid_lines(straight(0.0), np.array([[0.5, 2.3]]), np.array([False]), np.ones(1))
     strips = strip_pixels(image, lines, np.array([6.0]), np.zeros((1, 2)))
-    assert 0 < strips.beyond[0] < 1
-    assert strips.inside.sum() > 0
+    seen = lines.middle[0] + np.stack([strips.u, strips.v], axis=-1)[strips.inside]
+    assert len(seen) > 0
+    assert (seen > -0.5).all()
+    assert (seen < [99.5, 89.5]).all()
+    # A part of the strip is beyond the image.
+    assert lines.middle[0, 1] + 6 > 89.5 or lines.middle[0, 1] - 6 < -0.5
 
 
 def test_lines_bend_as_the_map_does() -> None:

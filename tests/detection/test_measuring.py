@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -119,6 +120,28 @@ def test_a_board_half_in_a_shadow_is_measured_on_both_sides(light: float) -> Non
         there = side * (plane.midpoints[:, 0] - border) > 20
         assert there[row].sum() > 0.95 * there.sum()
     assert np.abs(error[away]).max() < 0.1
+
+
+def test_lines_drawn_over_the_board_cost_hardly_any_vertices() -> None:
+    _, seen = take("base", 1)
+    (plane,) = seen.truth.planes
+    image = seen.image.copy()
+    for u, v in np.rint(plane.vertices[1:5:3, 2:7:4].reshape(-1, 2)).astype(int):
+        image[v + 7 : v + 9, u - 40 : u + 40] = image[v - 40 : v + 40, u + 7 : u + 9] = 140
+    grid, mirrored = found(plane, 1)
+    measured = measure(image, grid, "vertices")
+    assert len(measured.pixels) >= 50  # 34 if these pixels are not left out
+    error = measured.pixels - plane.vertices.reshape(-1, 2)[places(measured, plane, mirrored)]
+    assert np.abs(error).max() < 0.02
+
+
+def test_vertices_beside_the_image_border_are_measured() -> None:
+    _, seen = take("base", 1)
+    (plane,) = seen.truth.planes
+    left = int(plane.vertices[..., 0].min()) - 2
+    grid, _ = found(plane, 1)
+    measured = measure(seen.image[:, left:], replace(grid, pixels=grid.pixels - [left, 0.0]), "vertices")
+    assert len(measured.pixels) == 54
 
 
 def test_result_is_complete_and_repeatable() -> None:

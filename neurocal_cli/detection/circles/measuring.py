@@ -47,7 +47,7 @@ from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
-from neurocal_cli.detection.fitting.strips import GridImage, Single, Strips, packed
+from neurocal_cli.detection.fitting.strips import GridImage, Single, packed
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.grid import VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located
@@ -97,9 +97,8 @@ def outline_pixels(
     outline = seen[:, 1 + 2 * len(_ANGLES) : 1 + 3 * len(_ANGLES)]
     point, d, normal, bend, rho, near = _distances(seen, samples, radius, _around(outline, reach), reach)
     near &= (np.abs(d) < reach) & (rho > band[0]) & (rho < band[1])
-    framed = near & (point >= 0).all(axis=2) & (point < image.shape[::-1]).all(axis=2)
-    beyond = 1 - framed.sum(axis=1) / np.maximum(near.sum(axis=1), 1)
-    index, used = packed(framed, framed.sum(axis=1))
+    near &= (point >= 0).all(axis=2) & (point < image.shape[::-1]).all(axis=2)
+    index, used = packed(near)
     u, v, d, n_u, n_v, bend = (
         x.reshape(-1)[index] for x in (*np.moveaxis(point, 2, 0), d, *np.moveaxis(normal, 2, 0), bend)
     )
@@ -109,7 +108,7 @@ def outline_pixels(
         off = ((u - middle[:, :1]).astype(np.float32), (v - middle[:, 1:]).astype(np.float32))
         value, gain = shading.off(middle, *off, value)
     columns: list[Single] = [np.where(used, x, 0).astype(np.float32) for x in (d, n_u, n_v, bend)]
-    return CirclePixels(value, gain, np.ones_like(value), used.astype(np.float32), beyond, *columns)
+    return CirclePixels(value, gain, np.ones_like(value), used.astype(np.float32), *columns)
 
 
 def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -124,7 +123,7 @@ def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
     for mask, line in zip(along, np.rint(outline - low[:, None]).astype(np.int32), strict=True):
         cv2.polylines(mask, [line], True, 1, thickness)
     near = (away < (high - low)[:, None]).all(axis=2) & (along.reshape(len(low), -1) > 0)
-    index, used = packed(near, near.sum(axis=1))
+    index, used = packed(near)
     return low[:, None] + away[index % len(away)], used
 
 
@@ -154,7 +153,7 @@ def _distances(
     point, inside = window
     d, n, rho = nearer(point, point)
     near = inside & (np.abs(d) < _ROUGHLY * reach)
-    index, used = packed(near, near.sum(axis=1))
+    index, used = packed(near)
     d, rho = (x.reshape(-1)[index] for x in (d, rho))
     n, point = (x.reshape(-1, 2)[index] for x in (n, point))
     foot = point
@@ -317,8 +316,7 @@ def _profile(pixels: CirclePixels, fit: BatchFit) -> EdgeProfile | None:
     d = pixels.d - pixels.u * along_u - pixels.v * along_v - growth
     light = (pixels.value - mean) / (contrast * pixels.gain)
     zero, inside = np.zeros(len(d)), (pixels.root > 0) & (fit.step < 1)[:, None]
-    strips = Strips(d, d, light, inside, d, d, pixels.beyond)
-    return edge_profile(strips, zero, zero, np.ones(len(d)))
+    return edge_profile(d, light, inside, zero, zero, np.ones(len(d)))
 
 
 def _mean(values: Single, which: NDArray[np.bool_]) -> Array:

@@ -53,7 +53,6 @@ class FitPixels(PerFit):
     gain: Single  # half contrast at the pixel, relative to that at the fit's middle
     Q: Single  # effect of other lines on the light; see the models
     root: Single  # [1/DN] inverse standard deviation of the noise; 0 for pixels that are not used
-    beyond: Array  # (E,) share of the pixels that lie outside the image
     ink: Single | None = field(default=None, kw_only=True)  # what markers add to the light
 
     def weighed(self: Pixels, weight: Single) -> Pixels:
@@ -181,6 +180,28 @@ class BatchFit:
         """Continue from these values with another shape, and with other weights [1/DN^2] if given."""
         pixels = self.pixels if weight is None else self.pixels.weighed(weight)
         return fit_batch(self.model, pixels, self.values, self.prior, shape, steps, more)
+
+    def without(self, outliers: NDArray[np.bool_], which: NDArray[np.intp], steps: int) -> BatchFit:
+        """Repeat some of the fits without the pixels (n, N) that are outliers in them."""
+        pixels = self.pixels.part(which)
+        pixels = replace(pixels, root=np.where(outliers, np.float32(0), pixels.root))
+        shape, prior = self.shape.part(which), self.prior.part(which)
+        part = fit_batch(self.model, pixels, self.values[which], prior, shape, steps)
+
+        def joined(whole: NDArray[Any], some: NDArray[Any]) -> NDArray[Any]:
+            both = whole.copy()
+            both[which] = some
+            return both
+
+        self.linear.put(which, part.linear)
+        return replace(
+            self,
+            values=joined(self.values, part.values),
+            information=joined(self.information, part.information),
+            chi2=joined(self.chi2, part.chi2),
+            step=joined(self.step, part.step),
+            pixels=replace(self.pixels, root=joined(self.pixels.root, pixels.root)),
+        )
 
 
 def fit_batch(

@@ -105,7 +105,7 @@ def edge_pixels(
     lever = strips.s / (0.5 * lines.length).astype(np.float32)[:, None]
     value, gain = shading.off(lines.middle, strips.u, strips.v, strips.value)
     root = used.astype(np.float32)
-    return EdgePixels(value, gain, Q, root, strips.beyond, lever, strips.d, R, ink=strips.ink)
+    return EdgePixels(value, gain, Q, root, lever, strips.d, R, ink=strips.ink)
 
 
 def usual_stride(lines: Lines) -> int:

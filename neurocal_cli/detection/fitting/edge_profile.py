@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.fitting.strips import Single, Strips
+from neurocal_cli.detection.fitting.strips import Single
 
 Real = NDArray[np.floating]
 
@@ -263,18 +263,23 @@ class EdgeProfile:
     reflected: bool = False  # whether one side of the edges is the reflection of the other
 
 
-def edge_profile(strips: Strips, offset: Array, mean: Array, contrast: Array) -> EdgeProfile | None:
-    """Average the pixels around edges with offsets and levels (E,); None if there are too few."""
-    reach = np.abs(strips.d * strips.inside).max(axis=1)
+def edge_profile(
+    d: Single, value: Single, inside: NDArray[np.bool_], offset: Array, mean: Array, contrast: Array
+) -> EdgeProfile | None:
+    """Average the pixels around edges with offsets and levels (E,); None if there are too few.
+
+    The pixels (E, N) have distances from lines [px] and values; only those `inside` are used.
+    """
+    reach = np.abs(d * inside).max(axis=1)
     wide = reach >= _NARROWEST
     if np.count_nonzero(wide) < _FEWEST:
         return None
     some = np.flatnonzero(wide)[:: -(-np.count_nonzero(wide) // _MOST)]
     most = int(min(float(np.median(reach[some])), _FARTHEST) / _STEP)
-    inside = strips.inside[some]
+    inside = inside[some]
     zero, middle, half = (x[some].astype(np.float32)[:, None] for x in (offset, mean, contrast))
-    d = (strips.d[some] - zero)[inside]
-    light = ((strips.value[some] - middle) / half)[inside]
+    d = (d[some] - zero)[inside]
+    light = ((value[some] - middle) / half)[inside]
     place = np.rint(d / np.float32(_STEP)).astype(np.intp) + most
     used = (place >= 0) & (place <= 2 * most)
     place, d, light = place[used], d[used], light[used]

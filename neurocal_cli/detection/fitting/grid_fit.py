@@ -205,7 +205,7 @@ def _by_moments(
     sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
     variance = np.full(len(offset), _MOMENT_SIGMA**2)
     observations = grid_image.observations(lines, offset, variance, np.ones((len(offset), 1)))
-    profile = edge_profile(strips, offset, *levels)
+    profile = edge_profile(strips.d, strips.value, strips.inside, offset, *levels)
     return fit_map(found.map, observations, found.shift), sigma, levels, profile
 
 

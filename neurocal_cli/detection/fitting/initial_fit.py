@@ -44,10 +44,11 @@ _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior
 # have such a contrast, too.
 _FAINTEST, _NEIGHBOURS = 0.12, 9
 _MOST_BLUR = 2.0  # greatest ratio to the prior, or of the prior to it
-_MOST_BEYOND = 0.3  # greatest share of the pixels outside the image
 _LEAST_COUNT = 8  # pixels
 _LIMIT = 6.0  # standard deviations, for the distance from the map and for chi2
 _ROUGH = 0.5  # relative excess of chi2 that is always accepted
+# Standard deviations beyond which a pixel contradicts a rough fit, greatest share of such pixels, and rounds.
+_CONTRADICTS, _MOST_CONTRADICTING, _ROUNDS = 4.0, 0.15, 3
 _LEAST_SHARE = 0.2  # least share of good fits; fewer may agree by chance
 _MOST_SPREAD = 0.5  # sigma; greatest standard deviation of an offset
 # A fit has converged if its last step is below the first limit [standard deviations] or the second [px]. The
@@ -141,6 +142,21 @@ def is_typical(fit: BatchFit, place: Array) -> NDArray[np.bool_]:
     return seen & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
 
 
+def without_outlying_pixels(fit: BatchFit, steps: int) -> BatchFit:
+    """Repeat fits that disagree with their pixels without the few pixels that contradict them.
+
+    A wire may be before the board, or a program may have drawn lines into the image.
+    """
+    for _ in range(_ROUNDS):
+        rough = fit.chi2_per_pixel
+        off = fit.linear.residual**2 > _CONTRADICTS**2 * upper_median(rough)
+        few = np.count_nonzero(off, axis=1) < _MOST_CONTRADICTING * fit.count
+        which = np.flatnonzero((rough > _roughest(fit, rough)) & few)
+        if len(which):
+            fit = fit.without(off[which], which, steps)
+    return fit
+
+
 def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> NDArray[np.bool_]:
     """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
 
@@ -151,7 +167,7 @@ def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> 
     blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
     good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
-    good &= (fit.pixels.beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
+    good &= fit.count >= _LEAST_COUNT
     # The values before the levels are alternately the offset and the tilt of a line.
     offsets = range(0, fit.values.shape[1] + MEAN, 2)
     spread = fit.covariance[:, offsets, offsets]
@@ -161,9 +177,13 @@ def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> 
     good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
     rough = fit.chi2_per_pixel
-    among = rough[good] if known is None else known
+    good &= rough < _roughest(fit, rough[good] if known is None else known)
+    return good & (good.mean() > _LEAST_SHARE) if len(good) else good
+
+
+def _roughest(fit: BatchFit, among: Array) -> Array:
+    """(E,) greatest chi2 per pixel of fits that agree with their pixels, by that `among` others."""
     usual = upper_median(among) if len(among) else 1.0
     scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0
     chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
-    good &= rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual
-    return good & (good.mean() > _LEAST_SHARE) if len(good) else good
+    return np.asarray((1 + _ROUGH) * usual + _LIMIT * np.maximum(scatter, chance))

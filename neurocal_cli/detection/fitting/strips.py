@@ -98,7 +98,6 @@ class Strips:
     inside: NDArray[np.bool_]  # (E, N) False for the padding and for pixels outside the strip or the image
     u: Single  # (E, N) [px] relative to the line's middle
     v: Single  # (E, N) [px] the same
-    beyond: Array  # (E,) share of the strip's pixels that lie outside the image
     ink: Single | None = None  # (E, N) what markers add to the light [half contrasts]
 
 
@@ -146,12 +145,10 @@ def strip_pixels(
     d -= _column(0.5 * lines.curvature) * s * s
     inside = np.abs(d) <= _column(half_width)
     inside &= (s >= _column(low)) & (s <= _column(high))
-    used = total = np.count_nonzero(inside, axis=1)
     framed = _framed(column, top, rows, np.where(steep[:, None], image.shape, image.shape[::-1]))
     if framed is not None:
         inside &= framed
-        used = np.count_nonzero(inside, axis=1)
-    index, inside = packed(inside, used)
+    index, inside = packed(inside)
     s, d = s.reshape(-1).take(index), d.reshape(-1).take(index)
     u, v = lines.pixels(s, d)
     place, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
@@ -163,7 +160,7 @@ def strip_pixels(
         inside &= known
         value[~known] = 0
     of_ink = None if ink is None else ink.reshape(-1).take(place, mode="clip")
-    return Strips(s, d, value, inside, u, v, 1 - used / np.maximum(total, 1), of_ink)
+    return Strips(s, d, value, inside, u, v, of_ink)
 
 
 def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
@@ -182,12 +179,12 @@ def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.boo
     return inside.reshape(len(column), -1)
 
 
-def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def packed(wanted: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Indices (E, M) in the flat array of the wanted elements of each row, without gaps.
 
-    `count` (E,) is the number of wanted elements in each row. Beyond it, an index is 0 and the second result,
-    a mask (E, M), is False.
+    Beyond their number, an index is 0 and the second result, a mask (E, M), is False.
     """
+    count = np.count_nonzero(wanted, axis=1)
     most = int(count.max(initial=1))
     inside = np.arange(most) < count[:, None]
     index = np.zeros(inside.shape, dtype=np.intp)

@@ -44,7 +44,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     sharp_profile,
 )
 from neurocal_cli.detection.fitting.grid_fit import LEAST_SCALE, STEPS, GridFit
-from neurocal_cli.detection.fitting.initial_fit import is_reliable
+from neurocal_cli.detection.fitting.initial_fit import is_reliable, without_outlying_pixels
 from neurocal_cli.detection.fitting.map_fit import MapFit
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance
 from neurocal_cli.detection.fitting.strips import GridImage, Lines, Single, grid_lines, packed, strip_pixels
@@ -92,6 +92,7 @@ def fit_grid_vertices(
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
     fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
+    fit = without_outlying_pixels(fit, STEPS)
     fit = _with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
     if fitted.shifts.used:
         fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
@@ -186,7 +187,7 @@ def _vertex_pixels(
     nearer = np.abs(d1) <= np.abs(d2)
     nearer[:, parts[0].u.shape[1] :] ^= True  # in the second strip, nearer to the second line
     inside &= nearer
-    index, inside = packed(inside, inside.sum(axis=1))
+    index, inside = packed(inside)
     u, v, value = (x.reshape(-1)[index] for x in (u, v, value))
     (s1, d1), (s2, d2) = (_coordinates(line, u, v) for line in lines)
     inks = [part.ink for part in parts if part.ink is not None]
@@ -196,12 +197,9 @@ def _vertex_pixels(
     lever1, lever2 = (
         s / (0.5 * line.length).astype(np.float32)[:, None] for s, line in zip((s1, s2), lines, strict=True)
     )
-    beyond = np.maximum(parts[0].beyond, parts[1].beyond)
     weight, correlation = inside.astype(np.float32), rho.astype(np.float32)[:, None]
     relative = (np.stack(blur, axis=1) / (0.5 * (blur[0] + blur[1]))[:, None]).astype(np.float32)
-    return VertexPixels(
-        value, gain, Q, weight, beyond, lever1, d1, lever2, d2, correlation, relative, ink=ink
-    )
+    return VertexPixels(value, gain, Q, weight, lever1, d1, lever2, d2, correlation, relative, ink=ink)
 
 
 def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], blur: tuple[Array, Array]) -> Single:

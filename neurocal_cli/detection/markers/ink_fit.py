@@ -26,7 +26,7 @@ from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_again, fit_from
 from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
 from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import GridImage, Lines, Strips, grid_lines, strip_pixels
+from neurocal_cli.detection.fitting.strips import GridImage, Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Appearance, Ink, with_ink
 from neurocal_cli.detection.medians import upper_median
@@ -192,9 +192,7 @@ def _plain_profile(
             (plain, plain & patterned),
         )
     )
-    both = (np.concatenate([one, one], axis=1) for one in (strips.s, strips.u, strips.v))
-    s, u, v = both
-    found = edge_profile(Strips(s, d, value, inside, u, v, strips.beyond), offset, mean, contrast)
+    found = edge_profile(d, value, inside, offset, mean, contrast)
     return None if found is None else replace(found, reflected=True)
 
 
