@@ -145,26 +145,6 @@ def _evidence(solution: Solution) -> float:
     return lgamma(half) - half * log(pi * (solution.squared_error + floor))
 
 
-def judged_again(
-    problem: Problem, solution: Solution, rejected: Rejected, options: Options
-) -> tuple[Solution, Rejected]:
-    """Judge all points of a problem again by the lens of a solution.
-
-    It was fitted to the points an earlier lens had kept; that lens had rejected points, but no whole views.
-    """
-    points = problem.points
-    out = set() if rejected.points is None else set(_measurements(rejected.points))
-    mask = np.array([one not in out for one in _measurements(points)])
-    kept, solution = _all_judged(points, options, _Kept(mask, {}), solution)
-    return solution, _rejected(points, kept, solution)
-
-
-def _measurements(points: Correspondences) -> list[tuple[str, float, float]]:
-    """View and pixel of each point, which tell it from all others."""
-    names = [points.view_names[v] for v in points.view_index]
-    return list(zip(names, *points.pixels.T.tolist(), strict=True))
-
-
 def _is_of(points: Correspondences, view: str) -> NDArray[np.bool_]:
     """(N,) which points are of a view."""
     return points.view_index == points.view_names.index(view)

@@ -24,7 +24,7 @@ from neurocal_cli.calibration.lens_choice.model_selection import predicts_decide
 from neurocal_cli.calibration.lens_choice.monotonic_fit import normal_part
 from neurocal_cli.calibration.lens_choice.rich_fit import promised, with_displacement
 from neurocal_cli.calibration.other_causes import contest_of
-from neurocal_cli.calibration.outlier_rejection import judged_again
+from neurocal_cli.calibration.outlier_rejection import fit_robustly
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.options import Options
@@ -59,7 +59,8 @@ def with_rich_lens(
     found = rich.model_errors
     if len(rejected):
         try:
-            rich, rejected = judged_again(problem, rich, rejected, options)
+            named = replace(options, distortion="")
+            rich, rejected = fit_robustly(problem.with_model("rich"), named)
         except DegenerateGeometryError:  # with other points there is no such lens
             return solution, rejected
     return replace(rich, model_errors=found), rejected
