@@ -58,12 +58,7 @@ from neurocal_cli.calibration.verdict.measures import (
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
 from neurocal_cli.calibration.verdict.rules import reach_verdict
-from neurocal_cli.calibration.verdict.what_is_given import (
-    Proportions,
-    hidden_by_lens,
-    hidden_by_target,
-    proportions,
-)
+from neurocal_cli.calibration.verdict.what_is_given import Proportions, hidden_centre, proportions
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion
@@ -348,10 +343,9 @@ class _AtMinimum:
         target = self.calibration.target
         if self.calibration.type != 2 or self._is_exact():
             return []
-        if target is None and self.state.model != "rich":
-            return hidden_by_lens(self.calibration, self.views, self.given, self.free, self.repeated.worth)
         points = self.points if target is None else target.as_given(self.points)
-        return hidden_by_target(self.calibration, points, self._arranged(points), self.given)
+        views = self.views if target is None else self._arranged(points)
+        return hidden_centre(self.calibration, points, views, self.given, self.repeated.worth)
 
     def _proportions(self, contradiction: float) -> Proportions | None:
         given = self.calibration.target is None and self.calibration.type in (1, 2)

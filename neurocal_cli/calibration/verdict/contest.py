@@ -75,15 +75,13 @@ def contest(
     *,
     named_lens: bool = True,
     worth: float = 1.0,
-    more: tuple[Rival, ...] = (),
     shaped: bool = False,
 ) -> Contest | None:
     """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
 
     The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
     estimated. A lens that was selected is not too simple. `worth` is the effective share of the views if they
-    repeat poses. Rivals of this case alone may be given as `more`. `shaped` tells whether
-    the target's common shape was estimated with the camera.
+    repeat poses. `shaped` tells whether the target's common shape was estimated with the camera.
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
@@ -91,7 +89,7 @@ def contest(
     if shaped:
         lin = _with_shape(lin)
     try:
-        return _held(lin, (*RIVALS, *more), worth)
+        return _held(lin, worth)
     except np.linalg.LinAlgError:
         return None
 
@@ -107,9 +105,9 @@ def _with_shape(lin: Linearised) -> Linearised:
     return replace(lin, R=R, free=np.concatenate([lin.free, new]), spare=max(lin.spare - len(new), 1.0))
 
 
-def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
+def _held(lin: Linearised, worth: float) -> Contest:
     n = lin.spare * worth
-    ranking = estimates(lin, n, rivals, LEVEL)
+    ranking = estimates(lin, n, RIVALS, LEVEL)
     fits: dict[_Key, _Fit | None] = {}
     if ranking and ranking[0].evidence > LEVEL:
         # Alike even with the best rival, not because of it.
@@ -118,11 +116,11 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
         nearest = min(found, key=lambda fit: fit.cost, default=_Fit(np.inf))
         if nearest.errors is not None and nearest.cost < float((errors**2).sum()):
             errors = nearest.errors
-        alike, of_two = correlation(lin.views, errors), _errors_of_two(lin, ranking[0], rivals, n)
+        alike, of_two = correlation(lin.views, errors), _errors_of_two(lin, ranking[0], n)
         if of_two is not None:
             alike = min(alike, correlation(lin.views, of_two))
         n = effective_number(n, alike)
-        ranking = [_refined(lin, one, fits) for one in estimates(lin, n, rivals)]
+        ranking = [_refined(lin, one, fits) for one in estimates(lin, n, RIVALS)]
         ranking.sort(key=lambda one: -one.evidence)
     share = n / lin.spare
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
@@ -130,7 +128,7 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     close: list[tuple[Estimate, ...]] = []
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _likeliest_first(ranking)
-        chosen = _best(at, ranking, rivals, share)
+        chosen = _best(at, ranking, share)
         far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
         least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
         for one in chosen:
@@ -139,16 +137,16 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
             close.append(tuple(x for x in ranking[1:] if alone and x.evidence > one.evidence - LEVEL))
             evidence, left = evidence + one.evidence, left * (1.0 - one.explained)
             at = including(at, one)
-        ranking = estimates(at, at.spare * share, _others(rivals, causes))
+        ranking = estimates(at, at.spare * share, _others(causes))
     # As an estimated target counts it: all residuals as independent.
     evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
     return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence)
 
 
-def _errors_of_two(lin: Linearised, first: Estimate, rivals: Iterable[Rival], n: float) -> Array | None:
+def _errors_of_two(lin: Linearised, first: Estimate, n: float) -> Array | None:
     """(N, 2) residuals with a second cause beside the first; at least one of them is shared by views."""
     at = including(lin, first)
-    seconds = estimates(at, n, _others(rivals, [first]), LEVEL)
+    seconds = estimates(at, n, _others([first]), LEVEL)
     second = next((one for one in seconds if first.weights.size or one.weights.size), None)
     if second is None or second.evidence < LEVEL:
         return None
@@ -167,14 +165,12 @@ def _likeliest_first(ranking: list[Estimate]) -> list[Estimate]:
     return sorted(ranking[:n], key=lambda one: (not one.rival.of_given, one.rival.unknown)) + ranking[n:]
 
 
-def _others(rivals: Iterable[Rival], causes: Iterable[Estimate]) -> tuple[Rival, ...]:
+def _others(causes: Iterable[Estimate]) -> tuple[Rival, ...]:
     known = {one.rival.cause for one in causes}
-    return tuple(one for one in rivals if one.cause not in known)
+    return tuple(one for one in RIVALS if one.cause not in known)
 
 
-def _best(
-    at: Linearised, ranking: list[Estimate], rivals: tuple[Rival, ...], share: float
-) -> tuple[Estimate, ...]:
+def _best(at: Linearised, ranking: list[Estimate], share: float) -> tuple[Estimate, ...]:
     """The best rival, or the best two that are more probable together."""
     best: tuple[Estimate, ...] = (ranking[0],)
     highest = ranking[0].evidence + LEVEL
@@ -183,7 +179,7 @@ def _best(
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
     for one in [one for one in others if one.weights.size][:_MOST]:
         both = including(at, one)
-        second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
+        second = estimates(both, both.spare * share, _others([one]), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
         second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
         if second and one.evidence + second[0].evidence > highest:

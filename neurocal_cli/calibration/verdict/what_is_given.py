@@ -16,11 +16,10 @@ nearly as well as a separate camera for each view, and far better than with the 
 points of a view are then those of a grid with as many columns as it should have rows, in the same order. A
 homography maps the right grid to the pixels, but for distortion, and no homography maps the wrong one.
 
-`hidden_by_lens` and `hidden_by_target` test a given centre. The poses absorb a wrong centre, and tangential
-distortion or the shape of the target the rest, so the error hardly grows and no cause is open. Therefore the
-contest is held without tangential distortion, which is a rival instead. An estimated target is estimated
-again with a free centre, and the evidence compared, because a bent target and a wrong centre may explain the
-points only together.
+`hidden_centre` tests a given centre. The poses absorb a wrong centre, and tangential distortion or the shape
+of the target the rest, so the error hardly grows and no cause is open. Therefore the camera is fitted with a
+free centre: without tangential distortion, or with the target estimated again, because a bent target and a
+wrong centre may explain the points only together.
 """
 
 from __future__ import annotations
@@ -28,18 +27,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.adjust import NEARBY, Adjusted, adjust
+from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.outlier_views import variance_of_views
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.verdict.contest import contest, given_camera
 from neurocal_cli.calibration.verdict.effects import stretch
-from neurocal_cli.calibration.verdict.findings import CONTRADICTION, EXPLAINED, LEVEL, Finding
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION, EXPLAINED, LEVEL, Finding, log_odds
 from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import estimates
@@ -53,75 +51,75 @@ from neurocal_cli.errors import NeurocalError
 from neurocal_cli.network.options import options_for
 from neurocal_cli.observations.points import Correspondences
 
-_TANGENTIAL = ("p1", "p2")
+_TANGENTIAL = frozenset({"p1", "p2"})
 _DISPLACED = "k1k2"  # the model instead of a rich lens
+_Fit = tuple[Problem, Adjusted]
 
 
-def hidden_by_lens(
-    calibration: Calibration, views: Views, state: CameraState, free: NDArray[np.bool_], worth: float
+def hidden_centre(
+    calibration: Calibration, points: Correspondences, views: Views, state: CameraState, worth: float
 ) -> list[Finding]:
-    """What the points say against the given centre if tangential distortion, which was estimated, hides it.
-
-    The views have the target as given, the state is in pixels, and `free` (5 + K,) are the estimated
-    parameters. `worth` is the effective share of the views if they repeat poses.
-    """
-    names = coefficient_names(state.model)
-    tangential = free & np.isin(np.arange(len(free)), [5 + names.index(p) for p in _TANGENTIAL if p in names])
-    if not tangential.any():
-        return []
-    start = normalised(replace(state, k=np.where(tangential[5:], 0.0, state.k)), views)
-    adjusted = adjust(views.batches, start, free & ~tangential, True, NEARBY)
-    lens = replace(RIVALS[0], steps=lambda lin: np.eye(lin.width)[:, np.flatnonzero(tangential)])
-    held = contest(
-        views, adjusted.state, free & ~tangential, True, calibration.points.image_size, worth=worth,
-        more=(lens,),
-    )  # fmt: skip
-    # A given value comes first of those that are hardly less probable, also where it is no more than chance.
-    if held is None or not held.causes or not held.causes[0].evidence > LEVEL:
-        return []
-    return given_camera(held, calibration)
-
-
-def hidden_by_target(
-    calibration: Calibration, points: Correspondences, views: Views, state: CameraState
-) -> list[Finding]:
-    """What the points say against the given centre if the target, which was estimated, hides it.
+    """What the points say against the given centre if what was estimated hides it: the target, or the lens.
 
     `points` have the target as given, `views` are the same, weighted as in the calibration, and the state is
-    in pixels and world units.
+    in pixels and world units. `worth` is the effective share of the views if they repeat poses.
     """
-    from neurocal_cli.adjustment.board.find import find_target, gain_over_given
+    shaped = calibration.target is not None
+    if state.model == "rich":  # as flexible as a target
+        shaped, state = True, replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
+    names, before = coefficient_names(state.model), state.entries[0, 3:]
+    hiding = frozenset() if shaped else _TANGENTIAL.intersection(names) - calibration.fixed
+    if not (shaped or hiding):
+        return []
 
-    if state.model == "rich":
-        state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
-    before = state.entries[0, 3:]
-    centre = float(before[0]), float(before[1])
-
-    def fitted(free_centre: bool) -> tuple[Problem, Adjusted]:
+    def fitted(free_centre: bool, without: frozenset[str]) -> _Fit:
         problem = problem_for(
             points,
             1 if free_centre else 2,
-            image_center=None if free_centre else centre,
+            image_center=None if free_centre else (float(before[0]), float(before[1])),
             skew="theta" not in calibration.fixed,
             distortion=Distortion(state.model),
+            square=calibration.square_pixels,
         )
-        problem = replace(problem, views=views)
-        return problem, problem.adjust(normalised(state, views))
+        known = calibration.fixed - {"u0", "v0"} | without
+        problem = replace(problem, views=views, fixed=problem.fixed | known)
+        k = np.where(np.isin(names, list(without)), 0.0, state.k)
+        return problem, problem.adjust(normalised(replace(state, k=k), views))
 
-    fit = fitted(free_centre=False)
-    kept, found = find_target([fit]), find_target([fitted(free_centre=True)])
+    kept, free = fitted(False, frozenset()), fitted(True, hiding)
+    found = _with_target(kept, free) if shaped else _with_lens(fitted(False, hiding), kept, free, worth)
     if found is None:
         return []
-    gain = gain_over_given(found, [fit]) if kept is None else found.evidence - kept.evidence
-    if not gain > LEVEL:
-        return []
-    problem, adjusted = found.fits[0]
+    problem, adjusted = found
     after = problem.matrix(adjusted.state.entries[0])[:2, 2]
     told = ", ".join(
         f"{name} = {old:.5g} is given, but the points give {new:.5g} px"
         for name, old, new in zip(("u0", "v0"), before, after, strict=True)
     )
     return [(CHANGED.grade(float(np.abs(after - before).max() / calibration.intrinsics.alpha_u)), told, SAME)]
+
+
+def _with_target(kept: _Fit, free: _Fit) -> _Fit | None:
+    """The fit with another target and a free centre, if it is more probable than with the given centre."""
+    from neurocal_cli.adjustment.board.find import find_target, gain_over_given
+
+    known, found = find_target([kept]), find_target([free])
+    if found is None:
+        return None
+    gain = gain_over_given(found, [kept]) if known is None else found.evidence - known.evidence
+    return found.fits[0] if gain > LEVEL else None
+
+
+def _with_lens(plain: _Fit, kept: _Fit, free: _Fit, worth: float) -> _Fit | None:
+    """The fit with a free centre, if it explains what the lens did, and the lens is not more probable.
+
+    Real lenses have less tangential distortion than hides a wrong centre, so the centre comes first.
+    """
+    (problem, adjusted), costs = free, [float(fit.cost.sum()) for _, fit in (plain, kept, free)]
+    alike = correlation(problem.views, point_residuals(problem.views, adjusted.state))
+    n = effective_number(max(problem.views.n_equations - problem.n_parameters, 1.0) * worth, alike)
+    told = log_odds(costs[0], costs[2], n, 2) > LEVEL and log_odds(costs[1], costs[2], n) > -LEVEL
+    return free if told else None
 
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
