@@ -35,10 +35,12 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-_MOST = 3  # causes at once, and rivals that are tried together with another one
+_MOST_CAUSES = 3  # at once
+_TRIED = 3  # rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
-_MUCH = 0.3  # share of the evidence, or of the squared error
+_BESIDE = 0.3  # share of the evidence from which on a cause counts beside the target's shape
+_EXPLAINS_MUCH = 0.3  # share of the squared error from which on a lens or a given value is fitted
 
 
 @frozen_dataclass(eq=False)
@@ -63,7 +65,7 @@ class Contest:
     def beside_board(self) -> bool:
         """Whether a known cause other than the shape of the target is a good part of the explanation."""
         others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
-        return max(others, default=0.0) > _MUCH * sum(one.evidence for one in self.causes)
+        return max(others, default=0.0) > _BESIDE * sum(one.evidence for one in self.causes)
 
 
 def contest(
@@ -126,7 +128,7 @@ def _held(lin: Linearised, worth: float) -> Contest:
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
     causes: list[Estimate] = []
     close: list[tuple[Estimate, ...]] = []
-    while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
+    while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST_CAUSES:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, share)
         far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
@@ -177,7 +179,7 @@ def _best(at: Linearised, ranking: list[Estimate], share: float) -> tuple[Estima
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
-    for one in [one for one in others if one.weights.size][:_MOST]:
+    for one in [one for one in others if one.weights.size][:_TRIED]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others([one]), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
@@ -241,7 +243,7 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
     of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
-    if (of_given or one.rival.cause == TOO_SIMPLE) and one.explained > _MUCH:
+    if (of_given or one.rival.cause == TOO_SIMPLE) and one.explained > _EXPLAINS_MUCH:
         added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
         fit = adjust(views.batches, state, free, True, NEARBY)
