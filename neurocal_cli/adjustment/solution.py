@@ -118,7 +118,6 @@ class Solution:
     would_take: frozenset[str] = frozenset()
     # The straight lines from which ``distortion="plumb-line"`` estimated the distortion.
     straight_lines: StraightLines | None = None
-    refusal: str = ""  # why this solution must be refused; empty if it is valid
     # The target if it was estimated with the camera; the problem's points are then those of the target.
     target: Target | None = None
     # A minimum, and a function that returns the posterior of the target there for a noise variance [px^2].

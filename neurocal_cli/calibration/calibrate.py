@@ -217,8 +217,6 @@ def calibrate(
                 solution, rejected = _solved(stated(True), options, outliers, choice)
             if known_target is not None:
                 solution = solution.noted(target=known_target)
-            if solution.refusal:
-                raise DegenerateGeometryError(solution.refusal)
             found = calibration_of(
                 solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
             )

@@ -96,10 +96,10 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
         if solution.spare_equations <= 0:
             raise
         return solution, _rejected(problem.points, kept, solution)
-    errors = None if first.refusal else point_errors(first, problem.points)
-    contradicts = errors is None or _contradicts_noise(first, errors)
+    errors = point_errors(first, problem.points)
+    contradicts = _contradicts_noise(first, errors)
     # So large errors may hide outliers.
-    rough = errors is None or errors.rms > _ROUGH * pixel_spread(problem.points)
+    rough = errors.rms > _ROUGH * pixel_spread(problem.points)
     if not (contradicts or rough):
         return first, Rejected()
     try:
@@ -131,7 +131,7 @@ def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:
     """Whether the evidence of the fit of the points kept is larger than that of all points."""
     points = first.problem.points
     n, k = len(points), int((~kept.mask).sum())
-    if first.refusal or not k:
+    if not k:
         return True
     area = float(np.prod(points.image_size or np.ptp(points.pixels, axis=0)))
     gain = _evidence(solution) - k * log(area) - log(comb(n, k)) - _evidence(first)
@@ -322,8 +322,7 @@ def _with_fitting_views(
         found = _all_judged(points, options, _Kept(mask, wrong), more)
     except DegenerateGeometryError:
         return kept, solution
-    better = not found[1].refusal and rms(found[1]) <= NO_WORSE * rms(solution)
-    return found if better else (kept, solution)
+    return found if rms(found[1]) <= NO_WORSE * rms(solution) else (kept, solution)
 
 
 def _judged(points: Correspondences, kept: _Kept, solution: Solution) -> _Kept:

@@ -51,7 +51,7 @@ def with_rich_lens(
     not the cause.
     """
     looked_for = choice == "auto" and options.distortion == "auto" and problem.points.world_std is None
-    if not looked_for or solution.refusal or rejected.views or not solution.problem.free_poses:
+    if not looked_for or rejected.views or not solution.problem.free_poses:
         return solution, rejected
     rich = _rich_lens(solution)
     if rich is None:

@@ -182,10 +182,10 @@ def with_target(
     "free". Raises `InputError` if a point has two different standard deviations, and, for points with any,
     `DegenerateGeometryError` if they do not determine the camera.
     """
-    if problem.points.world_std is not None and not solution.refusal:
+    if problem.points.world_std is not None:
         return _with_survey(problem, solution, rejected, options)
     rich = solution.state.model == "rich"  # flexible enough to absorb a bent target
-    if solution.refusal or options.distortion == "plumb-line" or rich:
+    if options.distortion == "plumb-line" or rich:
         return solution, rejected
     known = _searched(problem, solution, rejected, options, choice)
     if not _may_contradict_only_given(problem, *known):
@@ -288,7 +288,7 @@ def _fitted_to(
             again = fit_again(solution, solution.problem.points, options, only_from_here=True)
     except DegenerateGeometryError:
         return None
-    return None if again.refusal else (again, rejected)
+    return again, rejected
 
 
 def _is_where_it_was(found: Found, again: Solution) -> bool:
@@ -399,8 +399,6 @@ def _surveyed(
         weighed = fit_again(solution, judged, options)
     kept = weighed.problem.points.lines
     assert kept is not None
-    if weighed.refusal:
-        return weighed, rejected
     own = weighed.problem.with_points(points.select(kept))
     if not own.free_distortion:
         own = own.with_seen_pixels()

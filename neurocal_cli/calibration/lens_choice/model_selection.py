@@ -62,7 +62,6 @@ _CERTAIN = 2.0
 # cameras, of which one is left if points are held out where these are predicted as well.
 _FEW_POSES = 4
 _DECIDEDLY = 1.03
-_FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
 _BETTER = 0.999  # ratio of squared errors below which another start is better
@@ -77,7 +76,6 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
 
     `more_starts` are tried in case the first one leads to a local minimum. The `preferred` model is selected
     unless another predicts decidedly better. The result has the cross-validation errors of all fitted models.
-    It is a refusal if the distortion is strong and the model that fits is not monotonic inside the image.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
@@ -108,7 +106,6 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
         adjusted=replace(chosen.adjusted, iterations=iterations),
         would_take=solution.would_take | (good - {name}),
         model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
-        refusal=_refusal(fitted, chosen),
     )
 
 
@@ -275,19 +272,6 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
         return sound or monotonic
     lowest = [min(c.held_out for c in some.values()) for some in (sound, monotonic)]
     return sound if lowest[0] < _WORTH**2 * lowest[1] else monotonic
-
-
-def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
-    """Why the result must be refused: the model that fits is not monotonic, the selected one far worse."""
-    for model, candidate in fitted.items():
-        bad = candidate.not_monotonic is not None and not candidate.noise and candidate.cost < chosen.cost
-        if bad and chosen.held_out > _FAR_WORSE**2 * candidate.held_out:
-            return (
-                f"the distortion is strong, and the model {model} that fits the points is not monotonic "
-                f"(maps two directions to one pixel) inside the {candidate.not_monotonic}; give points "
-                "nearer to the image's corners, or choose a --distortion"
-            )
-    return ""
 
 
 def find_lens_and_target(
