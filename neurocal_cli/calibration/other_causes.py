@@ -14,21 +14,20 @@ reason for which it was left out.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import NEARBY, Adjusted, adjust
 from neurocal_cli.adjustment.board.find import Found, counted_again, gain_over_given, views_for_target
-from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
+from neurocal_cli.adjustment.problem import Problem, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
-from neurocal_cli.calibration.lens_choice.model_selection import (
-    richer_lens_is_better,
-)
-from neurocal_cli.calibration.point_errors import places_of_views
+from neurocal_cli.calibration.fit import fit
+from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
+from neurocal_cli.calibration.point_errors import places_of_views, rms
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.effects import BENDS, bends, common
 from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds, pixel_spread
@@ -37,13 +36,9 @@ from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import estimates
 from neurocal_cli.calibration.verdict.rivals import RIVALS, TOO_SIMPLE
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.network.options import options_for
-from neurocal_cli.network.orthogonality import cameras_from_products
-from neurocal_cli.network.view_networks import train_networks
 from neurocal_cli.observations.points import Correspondences
 
 _FAR = 2.0  # times the log evidence of the found target
@@ -141,47 +136,46 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     """
     if not arrange(points).nearly_flat.all() or len(points) < 6:
         return otherwise
-    limit, start = _HOLDS * rmse_px, _pose(points, camera)
-    plain = _fit(points, start)
+    limit, plain = _HOLDS * rmse_px, _posed(points, camera)
     mistakes = list(_mistakes(points, camera))
-    if start is None or plain.state is None:
-        return next((reason for reason, rms, _ in mistakes if rms < limit), otherwise)
+    if plain is None:
+        return next((reason for reason, error, _ in mistakes if error < limit), otherwise)
+    own = rms(plain)
 
-    def odds(rms: float, unknowns: int = 0) -> float:
+    def odds(error: float, unknowns: int = 0) -> float:
         """Errors below the other views' do not count."""
-        before, after = (max(error, rmse_px) ** 2 for error in (plain.rms, rms))
-        return log_odds(before, after, 2 * len(points) - 6, unknowns) if np.isfinite(rms) else -np.inf
+        before, after = (max(one, rmse_px) ** 2 for one in (own, error))
+        return log_odds(before, after, 2 * len(points) - 6, unknowns) if np.isfinite(error) else -np.inf
 
     # A turned image needs no unknowns, so it is more probable than a crop that looks the same by chance.
-    known = [(rms, odds(rms / scale), reason) for reason, rms, scale in mistakes]
-    zoomed, moved = (_fit(points, start, some) for some in (_FOCAL, _CENTRE))
-    times = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
+    known = [(error, odds(error / scale), reason) for reason, error, scale in mistakes]
+    (zoomed, a), (moved, b) = (_with_free(plain, some) for some in (_FOCAL, _CENTRE))
+    times = a[[0, 2]] / np.array(camera.entries)[[0, 2]]
     if abs(times[0] / times[1] - 1) < _ALIKE:
-        how = f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
-        known.append((zoomed.rms, odds(zoomed.rms, 2), how + _or_bent(abs(times[0] - 1))))
-    how = f"it fits another camera or crop: the image centre ({moved.entries[3]:.0f}, {moved.entries[4]:.0f})"
-    shift = float(np.hypot(*(moved.entries[3:] - np.array(camera.entries)[3:])))
-    known.append((moved.rms, odds(moved.rms, 2), how + _or_bent(shift / camera.entries[0])))
-    least = LEVEL + max(odds(_rms_if_bent(points, plain.state), len(BENDS)), 0.0)
-    likely = [(evidence, reason) for rms, evidence, reason in known if rms < limit and evidence > least]
+        how = f"it fits another zoom or focus: a focal length of {a[0]:.5g} px"
+        known.append((zoomed, odds(zoomed, 2), how + _or_bent(abs(times[0] - 1))))
+    how = f"it fits another camera or crop: the image centre ({b[3]:.0f}, {b[4]:.0f})"
+    shift = float(np.hypot(*(b[3:] - np.array(camera.entries)[3:])))
+    known.append((moved, odds(moved, 2), how + _or_bent(shift / camera.entries[0])))
+    least = LEVEL + max(odds(_rms_if_bent(plain), len(BENDS)), 0.0)
+    likely = [(evidence, reason) for error, evidence, reason in known if error < limit and evidence > least]
     if likely:
         return max(likely)[1]
-    free = _fit(points, start, (*_FOCAL, *_CENTRE)).rms
+    free, _ = _with_free(plain, (*_FOCAL, *_CENTRE))
     if free > _BLURRED * pixel_spread(points):
         return otherwise
-    if plain.rms < _HOLDS * free:
-        times = f"{plain.rms / rmse_px:.2g} times that of the others"
-        return f"its rms error is {plain.rms:.2g} px, {times}: blurred, or bent"
+    if own < _HOLDS * free:
+        ratio = f"{own / rmse_px:.2g} times that of the others"
+        return f"its rms error is {own:.2g} px, {ratio}: blurred, or bent"
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
 
 
-def _rms_if_bent(points: Correspondences, state: CameraState) -> float:
+def _rms_if_bent(plain: Solution) -> float:
     """Rms error [px] that a bend of the target leaves in one view, linearised; infinite without a board."""
-    views, given = arrange(points), np.zeros(5 + state.k.shape[-1], dtype=bool)
-    lin = linearised(views, state, given, True, (bends,), points.image_size, richer=False)
+    problem = plain.problem
+    lin = linearised(problem.views, plain.state, problem.free_camera, True, (bends,), None, richer=False)
     found = estimates(lin, lin.spare, (_BENT,), -np.inf)
-    left = (1.0 - found[0].explained) * lin.cost if found else np.inf
-    return float(np.sqrt(left / len(points))) * views.pixel_scale
+    return rms(plain) * float(np.sqrt(1.0 - found[0].explained)) if found else np.inf
 
 
 def _mistakes(points: Correspondences, camera: Camera) -> Iterator[tuple[str, float, float]]:
@@ -189,13 +183,13 @@ def _mistakes(points: Correspondences, camera: Camera) -> Iterator[tuple[str, fl
     for reason, changed in _other_points(points):
         scale = float(np.sqrt(np.prod(np.ptp(changed.pixels, axis=0) / np.ptp(points.pixels, axis=0))))
         scale = 1.0 if reason.startswith("its u and v") else scale
-        yield reason, _fit(changed, _pose(changed, camera)).rms, scale
+        yield reason, error_of_view(changed, camera), scale
 
 
 def error_of_view(points: Correspondences, camera: Camera) -> float:
     """Rms error [px] of one view's points with their pose fitted; infinite if that fails."""
-    plain = replace(points, covariance=None, across=None)
-    return _fit(plain, _pose(plain, camera)).rms
+    posed = _posed(replace(points, covariance=None, across=None), camera)
+    return np.inf if posed is None else rms(posed)
 
 
 def _or_bent(change: float) -> str:
@@ -222,38 +216,23 @@ def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondence
         yield "its rows are shifted by one against its pixels", shifted
 
 
-def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
-    """The camera, and the view's pose estimated with it [px]; None if the pose cannot be estimated."""
+def _posed(points: Correspondences, camera: Camera) -> Solution | None:
+    """The view's pose with the camera; None if it cannot be estimated."""
     try:
         problem = problem_for(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
-        groups, _ = train_networks(
-            problem, options_for("lm", _STARTS, 0), np.random.default_rng(0), np.ones(1, dtype=bool)
-        )
-        state = cameras_from_products(problem, groups, problem.normalised_entries[None])
+        return fit(problem, options_for("lm", _STARTS, 0))
     except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
         return None
-    return in_pixels(*problem.as_seen(state))
 
 
-@frozen_dataclass(eq=False)
-class _Fitted:
-    """A view's pose and some of the entries, adjusted."""
-
-    rms: float = np.inf  # [px]; infinite if that fails
-    entries: Array = field(default_factory=lambda: np.full(5, np.nan))  # of A [px]
-    state: CameraState | None = None  # normalised
-
-
-def _fit(points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()) -> _Fitted:
-    """Adjust a view's pose and the free entries."""
-    if start is None:
-        return _Fitted()
-    views = arrange(points)
-    moving = np.isin(np.arange(5 + start.k.shape[-1]), free)
+def _with_free(plain: Solution, free: tuple[int, ...]) -> tuple[float, Array]:
+    """The rms error [px], and the entries (5,) of A [px], with some of them free; infinite if that fails."""
+    problem, views = plain.problem, plain.problem.views
+    moving = np.isin(np.arange(len(problem.free_camera)), free)
     try:
-        adjusted = adjust(views.batches, normalised(start, views), moving, True, NEARBY)
+        adjusted = adjust(views.batches, plain.state, moving, True, NEARBY)
     except (np.linalg.LinAlgError, FloatingPointError):
-        return _Fitted()
-    rmse = float(np.sqrt(adjusted.cost.sum() / len(points))) * views.pixel_scale
+        return np.inf, np.full(5, np.nan)
+    rmse = float(np.sqrt(adjusted.cost.sum() / len(problem.points))) * views.pixel_scale
     entries = views.pixel_scale * adjusted.state.entries[0] + np.array([0, 0, 0, *views.pixel_centre])
-    return _Fitted(rmse, entries, adjusted.state) if np.isfinite(rmse) else _Fitted()
+    return rmse if np.isfinite(rmse) else np.inf, entries
