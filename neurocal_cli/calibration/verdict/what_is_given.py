@@ -90,28 +90,32 @@ def hidden_centre(
     found = _with_target(kept, free) if shaped else _with_lens(fitted(False, hiding), kept, free, worth)
     if found is None:
         return []
-    problem, adjusted = found
+    (problem, adjusted), explained = found
     after = problem.matrix(adjusted.state.entries[0])[:2, 2]
     told = ", ".join(
         f"{name} = {old:.5g} is given, but the points give {new:.5g} px"
         for name, old, new in zip(("u0", "v0"), before, after, strict=True)
     )
-    return [(CHANGED.grade(float(np.abs(after - before).max() / calibration.intrinsics.alpha_u)), told, SAME)]
+    grade = CHANGED.grade(float(np.abs(after - before).max() / calibration.intrinsics.alpha_u))
+    return [(max(grade, 2 * int(explained > EXPLAINED)), told, SAME)]
 
 
-def _with_target(kept: _Fit, free: _Fit) -> _Fit | None:
-    """The fit with another target and a free centre, if it is more probable than with the given centre."""
+def _with_target(kept: _Fit, free: _Fit) -> tuple[_Fit, float] | None:
+    """The fit with another target and a free centre, if it is more probable than with the given centre.
+
+    Its second result is the share of the squared error that the centre explains; here the target may do so.
+    """
     from neurocal_cli.adjustment.board.find import find_target, gain_over_given
 
     known, found = find_target([kept]), find_target([free])
     if found is None:
         return None
     gain = gain_over_given(found, [kept]) if known is None else found.evidence - known.evidence
-    return found.fits[0] if gain > LEVEL else None
+    return (found.fits[0], 0.0) if gain > LEVEL else None
 
 
-def _with_lens(plain: _Fit, kept: _Fit, free: _Fit, worth: float) -> _Fit | None:
-    """The fit with a free centre, if it explains what the lens did, and the lens is not more probable.
+def _with_lens(plain: _Fit, kept: _Fit, free: _Fit, worth: float) -> tuple[_Fit, float] | None:
+    """The same of a free centre, if it explains what the lens did, and the lens is not more probable.
 
     Real lenses have less tangential distortion than hides a wrong centre, so the centre comes first.
     """
@@ -119,7 +123,7 @@ def _with_lens(plain: _Fit, kept: _Fit, free: _Fit, worth: float) -> _Fit | None
     alike = correlation(problem.views, point_residuals(problem.views, adjusted.state))
     n = effective_number(max(problem.views.n_equations - problem.n_parameters, 1.0) * worth, alike)
     told = log_odds(costs[0], costs[2], n, 2) > LEVEL and log_odds(costs[1], costs[2], n) > -LEVEL
-    return free if told else None
+    return (free, 1.0 - costs[2] / costs[0]) if told else None
 
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
