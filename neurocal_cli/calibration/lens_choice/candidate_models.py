@@ -304,8 +304,7 @@ def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     """Whether separate free networks fit the views far better than the best common camera.
 
-    The reason must be another one than the shape of the target. Of many views, an evenly spaced subset is
-    used.
+    Of many views, an evenly spaced subset is used.
     """
     best = min(fitted, key=lambda c: c.cost)
     n = views.n_views
@@ -314,23 +313,8 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     cost = float(normal[:, -1, -1].sum())
     if cost <= _FAR_FROM_SHORT**2 * float(least_of_free_networks(normal).sum()):
         return False
-    seen, state = views.subset(some), state.of_views(some)
-    least = _SHORT**2 * float(free_networks(seen, state, _STEPS).sum()) + 1e-20
-    return cost > least and cost * (1.0 - _by_shape(seen, state, best.problem)) > least
-
-
-def _by_shape(views: Views, state: CameraState, problem: Problem) -> float:
-    """Share of the squared error that a bent or a stretched target explains."""
-    from neurocal_cli.calibration.verdict.linearised import linearised
-    from neurocal_cli.calibration.verdict.rival import estimates
-    from neurocal_cli.calibration.verdict.rivals import SHAPES
-
-    effects = tuple(one.effect for one in SHAPES if one.effect is not None)
-    lin = linearised(views, state, problem.free_camera, problem.free_poses, effects, None, False)
-    try:
-        return max((one.explained for one in estimates(lin, lin.spare, SHAPES)), default=0.0)
-    except np.linalg.LinAlgError:
-        return 0.0
+    free = free_networks(views.subset(some), state.of_views(some), _STEPS)
+    return cost > _SHORT**2 * float(free.sum()) + 1e-20
 
 
 def worth(views: Views, fitted: Collection[Candidate]) -> float:

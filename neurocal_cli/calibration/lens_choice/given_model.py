@@ -40,8 +40,9 @@ from neurocal_cli.errors import DegenerateGeometryError
 # Repeated by test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # had a larger correlation.
 _CORRELATED = 0.15  # correlation of neighbouring residuals
-FEW_VIEWS = 20  # most views with which other starts are tested, to limit the time
-_LOWER = 0.999  # ratio of squared errors below which a minimum is lower
+_FEW_VIEWS = 20  # most views with which other starts are tested, to limit the time
+LOWER = 0.999
+"""Ratio of squared errors below which a minimum is lower."""
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # many, because the coefficients are nearly degenerate
 _STEPS_OF_SIMPLER = 60
@@ -63,11 +64,20 @@ def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
     poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
     if not poor and solution.alike < _CORRELATED:
         return solution
-    few = of_few_views(solution, FEW_VIEWS)
-    certain = few is solution or is_elsewhere(few, solution)
-    if certain or total_cost(_lowest(few, more_starts)) < _LOWER * total_cost(few.adjusted):
-        return replace(solution, adjusted=_lowest(solution, more_starts))
-    return solution
+    if not may_lead_lower(solution, LOWER, lambda few: total_cost(_lowest(few, more_starts))):
+        return solution
+    return replace(solution, adjusted=_lowest(solution, more_starts))
+
+
+def may_lead_lower(solution: Solution, share: float, lowest: Callable[[Solution], float]) -> bool:
+    """Whether other starts may lead below a share of the squared error; of many views, a few are tried.
+
+    `lowest` is the squared error of the best of them.
+    """
+    few = of_few_views(solution, _FEW_VIEWS)
+    if few is solution or is_elsewhere(few, solution):
+        return True
+    return lowest(few) < share * total_cost(few.adjusted)
 
 
 def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:

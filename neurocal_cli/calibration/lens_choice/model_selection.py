@@ -34,7 +34,7 @@ from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.residual_correlation import point_residuals
-from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
+from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.candidate_models import (
     FAR_BETTER,
@@ -45,7 +45,7 @@ from neurocal_cli.calibration.lens_choice.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, FEW_VIEWS, Starts
+from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, LOWER, Starts, may_lead_lower
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS
 from neurocal_cli.camera.geometry import Array
@@ -64,7 +64,6 @@ _FEW_POSES = 4
 _DECIDEDLY = 1.03
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
-_BETTER = 0.999  # ratio of squared errors below which another start is better
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
 _SIMPLER = -1.0  # and for a simpler one
 # Nested models: each has the coefficients of the previous one and more.
@@ -131,19 +130,14 @@ def _may_lead_lower(
     fitted: dict[str, Candidate], limit: float, solution: Solution, more_starts: Starts
 ) -> bool:
     """Whether another start leads below the limit; with many views, tested on a few of them."""
-    if not np.isfinite(limit) or solution.problem.points.n_views <= FEW_VIEWS:
-        return True
     closest = min(fitted.values(), key=lambda c: c.cost)
+
+    def lowest(few: Solution) -> float:
+        found = (fit_candidates(few.problem, start, by_views=False) for start in more_starts(few.problem))
+        return min((candidate.cost for each in found for candidate in each.values()), default=np.inf)
+
     whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
-    few = of_few_views(whole, FEW_VIEWS)
-    if is_elsewhere(few, whole):
-        return True
-    limit *= float(few.adjusted.cost.sum()) / closest.cost
-    return any(
-        candidate.cost < limit
-        for start in more_starts(few.problem)
-        for candidate in fit_candidates(few.problem, start, by_views=False).values()
-    )
+    return not np.isfinite(limit) or may_lead_lower(whole, limit / closest.cost, lowest)
 
 
 def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
@@ -155,7 +149,7 @@ def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
     if not any(c.sound for c in fitted.values()) or falls_short(views, fitted.values()):
         return np.inf
     closest = min(fitted.values(), key=lambda c: c.cost)
-    return _BETTER * closest.cost if closest.weak else 0.0
+    return LOWER * closest.cost if closest.weak else 0.0
 
 
 def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:
