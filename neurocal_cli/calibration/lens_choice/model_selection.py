@@ -84,8 +84,6 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     if not fitted:  # not even the pinhole converged
         return replace(solution, model_errors={})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
-    if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
-        fitted = {"none": fitted["none"]}  # a distortion would only hide that the camera is undetermined
     closest = min(fitted.values(), key=lambda c: c.cost).adjusted.state
     repeated = repeated_poses(views, closest, point_residuals(views, closest))
     if not repeated.none:
@@ -162,13 +160,6 @@ def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = No
 
 def _least_held_out(fitted: dict[str, Candidate]) -> float:
     return min(candidate.held_out for candidate in fitted.values())
-
-
-def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
-    """Whether neither a sound distortion model nor a camera for each view explains decidedly more."""
-    n, pinhole = worth(views, fitted.values()), fitted["none"]
-    lowest = min((c.criterion(n) for c in fitted.values() if c.sound), default=np.inf)
-    return pinhole.criterion(n) < lowest + DECISIVE and not falls_short(views, [pinhole])
 
 
 def _best(

@@ -140,75 +140,40 @@ def _clusters(values: Array, gap: float) -> Index:
 
 
 def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
-    """Line and point of each point on the lines of a target, whose pairs are all compared if they are few."""
+    """Line and point of each point on the lines of a target; of a large one, on those through some points."""
     n = len(target)
     if n <= _ALL_PAIRS:
-        a, b = np.triu_indices(n, 1)
-        line, member, _ = _through_pairs(target, a, b, fewest)
-        return line, member
-    anchors = np.linspace(0, n - 1, int(np.clip(_MOST_PAIRS // n, 4, 64))).astype(np.intp)
-    a, b = np.repeat(anchors, n), np.tile(np.arange(n), len(anchors))
-    line, member, directions = _through_pairs(target, a[a != b], b[a != b], fewest)
-    # All lines along the directions of the lines with the most points.
-    labels = _clusters(directions @ _OF_DIRECTION, _TOLERANCE)
-    _, first = np.unique(labels, return_index=True)
-    weight = np.bincount(labels, np.bincount(line))
-    most = int(np.clip(10**7 // n, 6, 24))
-    return _parallels(target, directions[first[np.argsort(-weight, kind="stable")[:most]]], fewest)
+        return _through_pairs(target, *np.triu_indices(n, 1), fewest)
+    some = np.linspace(0, n - 1, int(np.clip(_MOST_PAIRS // n, 4, 64))).astype(np.intp)
+    a, b = np.repeat(some, n), np.tile(np.arange(n), len(some))
+    return _through_pairs(target, a[a != b], b[a != b], fewest)
 
 
-def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Index, Index, Array]:
-    """Lines that several pairs of points have in common: line and point of each member, directions."""
+def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Index, Index]:
+    """Lines that several pairs of points have in common: line and point of each member."""
     along = target[b] - target[a]
     along /= np.linalg.norm(along, axis=1)[:, None]
     # Opposite directions are the same: the first component that is not nearly 0 becomes positive.
     leading = np.take_along_axis(along, (np.abs(along) > _NEARLY_0).argmax(axis=1)[:, None], axis=1)
     along *= np.where(leading < 0, -1.0, 1.0)
     offset = target[a] - (target[a] * along).sum(axis=1)[:, None] * along
-    by_direction = _clusters(along @ _OF_DIRECTION, _TOLERANCE)
-    place = offset @ _OF_PLACE
     # Offsets are compared only between pairs of one direction.
-    labels = _clusters(4.0 * by_direction + place, _TOLERANCE)
-    counts = np.bincount(labels)
-    common = counts[labels] >= fewest - 1
+    by_direction = _clusters(along @ _OF_DIRECTION, _TOLERANCE)
+    labels = _clusters(4.0 * by_direction + offset @ _OF_PLACE, _TOLERANCE)
+    common = np.bincount(labels)[labels] >= fewest - 1
     labels, a, b, along = labels[common], a[common], b[common], along[common]
     key = np.unique(np.concatenate([labels, labels]) * len(target) + np.concatenate([a, b]))
     line, member = np.divmod(key, len(target))
-    return _checked(line, member, target, labels, along, fewest)
-
-
-def _checked(
-    line: Index, member: Index, target: Array, labels: Index, along: Array, fewest: int
-) -> tuple[Index, Index, Array]:
-    """Keep the lines with enough points that are collinear, and renumber them."""
+    # Keep those with enough points that are collinear, and renumber them.
     names, first, counts = np.unique(line, return_index=True, return_counts=True)
     given, where = np.unique(labels, return_index=True)
-    direction = along[where[np.searchsorted(given, names)]]
     index = np.repeat(np.arange(len(names)), counts)
-    start = target[member[first]]
-    off = target[member] - start[index]
-    off -= (off * direction[index]).sum(axis=1)[:, None] * direction[index]
+    direction = along[where[np.searchsorted(given, names)]][index]
+    off = target[member] - target[member[first]][index]
+    off -= (off * direction).sum(axis=1)[:, None] * direction
     astray = np.linalg.norm(off, axis=1) > 3 * _TOLERANCE
     good = (counts >= fewest) & (np.bincount(index, astray, len(names)) == 0)
-    number = np.cumsum(good) - 1
-    keep = good[index]
-    return number[index[keep]], member[keep], direction[good]
-
-
-def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, Index]:
-    """All lines along some directions."""
-    lines, members, total = [], [], 0
-    for direction in directions:
-        offset = target - (target @ direction)[:, None] * direction
-        labels = _clusters(offset @ _OF_PLACE, _TOLERANCE)
-        order = np.argsort(labels, kind="stable")
-        along = np.broadcast_to(direction, (len(target), 3))
-        line, member, kept = _checked(labels[order], order, target, labels, along, fewest)
-        lines.append(line + total)
-        members.append(member)
-        total += len(kept)
-    none = np.zeros(0, dtype=np.intp)
-    return np.concatenate([none, *lines]), np.concatenate([none, *members])
+    return (np.cumsum(good) - 1)[index[good[index]]], member[good[index]]
 
 
 def _longest(line: Index, member: Index, n: int, most: int) -> tuple[Index, Index]:

@@ -75,7 +75,7 @@ def test_rows_and_columns_of_a_board_are_found_wherever_it_lies(seed: int, cols:
 
 @pytest.mark.parametrize("n", [20, 60])
 def test_all_lines_that_are_found_are_lines(n: int) -> None:
-    """Of a large target the parallels of its commonest lines are found, of a small one all."""
+    """Of a large target those through some of its points are found, of a small one all."""
     rng = np.random.default_rng(n)
     grid = 3.0 * board_midpoints(n, n)
     world = np.column_stack([grid, np.zeros(len(grid))]) @ random_rotation(rng)
