@@ -46,7 +46,6 @@ _MOST = 60  # most values of xi
 # -0.27 to 0.18.
 _POWERS, _SHARES = np.array([2, 4, 1, 1]), np.array([0.15, 0.1, 0.0015, 0.0015])
 _SIZE_OF_XI = 0.25  # prior std of xi of a double sphere
-_FEW_VIEWS = 40  # most views with which the grid is first tried, to limit the time
 
 
 def with_xi_held_if_flat(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted]:
@@ -93,25 +92,10 @@ class _Profile:
 
     def on_grid(self) -> _Profile:
         """Try each xi of the grid."""
-        tried = (self.held.adjust(start, _STEPS) for start in self._starts(self.best.state))
+        views, state, grid = self.problem.views, self.best.state, _GRID[self.problem.distortion.model]
+        starts = similar_states(state, state.model, farthest_angle(views, state), grid)
+        tried = (self.held.adjust(start, _STEPS) for start in starts)
         return replace(self, tried=[a for a in tried if a.converged and _is_lens(a)])
-
-    def _starts(self, state: CameraState) -> list[CameraState]:
-        """The most similar lens for each xi of the grid; with many views, only if some allow that xi."""
-        views, model = self.problem.views, self.problem.distortion.model
-        starts = similar_states(state, model, farthest_angle(views, state), _GRID[model])
-        if views.n_views <= _FEW_VIEWS:
-            return starts
-        some = np.unique(np.linspace(0, views.n_views - 1, _FEW_VIEWS).round().astype(np.intp))
-        few = replace(self.held, views=views.subset(some))
-        found = [few.adjust(replace(s, R=s.R[some], t=s.t[some]), _STEPS) for s in starts]
-        least = float(self.best.cost[some].sum())
-        share = views.n_equations / few.views.n_equations / self.variance
-        return [
-            replace(start, entries=a.state.entries, k=a.state.k)
-            for start, a in zip(starts, found, strict=True)
-            if share * (total_cost(a) - least) < _NEAR
-        ]
 
     def descended(self) -> tuple[_Profile, list[Adjusted]]:
         """Descend from the lowest points of the grid to the minima.
