@@ -137,12 +137,13 @@ def undistort(
         options.note_unused("without images", "interpolation")
     folder = _folder(paths, output) if paths else None
     outputs = [output for _ in paths] if folder is None else [_place(folder, path) for path in paths]
-    results = *zip(paths, outputs, strict=True), ("the new camera", new_camera), ("the tables", maps)
-    _check_distinct((camera, *paths), results)
-    preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
+    _check_distinct([*zip(paths, outputs, strict=True), ("the new camera", new_camera), ("the tables", maps)])
+    if folder is not None:
+        make_folder(folder)
+    preparation.check_outputs((new_camera, maps, *outputs), (camera, *paths))
     original = camera_of(preparation.known_camera(camera))
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
-    work = _Undistorting(original, view, interpolation, folder, original.image_size)
+    work = _Undistorting(original, view, interpolation, original.image_size)
     failed = work.correct_all(paths, outputs)
     note_once(work.notes)
     if new_camera is not None:
@@ -204,16 +205,13 @@ def _place(folder: str, path: str) -> str:
     return os.path.join(folder, os.path.splitext(name)[0] + ".png" if is_image(path) else name)
 
 
-def _check_distinct(inputs: Iterable[str], results: Iterable[tuple[str, str | None]]) -> None:
-    """Refuse to overwrite inputs, or to write two results, given as names and places, to the same file."""
-    read = {os.path.realpath(path) for path in inputs if path != "-"}
+def _check_distinct(results: Iterable[tuple[str, str | None]]) -> None:
+    """Refuse to write two results, given as names and places, to the same file."""
     taken: dict[str, str] = {}
     for source, target in results:
         if target is None:
             continue
-        place = os.path.realpath(target) if target != "-" else "-"
-        if place in read:
-            raise UsageError(f"{target} is an input and would be overwritten; give another output")
+        place = os.path.realpath(target)
         if place in taken:
             raise UsageError(f"{taken[place]} and {source} would both be written to {target}; rename one")
         taken[place] = source
@@ -226,7 +224,6 @@ class _Undistorting:
     camera: Camera
     view: Callable[[tuple[int, int] | None], Undistorted]  # of the results, from the size of the images
     interpolation: str
-    folder: str | None  # output folder, if the output is one
     size: tuple[int, int] | None  # of the images [px], once it is known
     notes: dict[str, list[str]] = field(default_factory=dict)  # remarks about images, and the images
     left_out: int = 0  # number of points that the result cannot show
@@ -319,8 +316,6 @@ class _Undistorting:
         """Undistort a file to its output."""
         path, output = place
         content = self._image(path, output) if is_image(path) else self._points(path)
-        if self.folder is not None:
-            make_folder(self.folder)
         write_whole(output, content)
 
     def _image(self, path: str, output: str) -> bytes:
