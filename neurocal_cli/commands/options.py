@@ -65,7 +65,7 @@ _GROUPS = {
     "Output": "output plot plots html lean as_json camera_name ros alpha overlay save_board cache help",
     "Research": "method trainer starts seed epochs rate rate_gamma training hidden",
 }
-_NOISE = re.compile(r"default: \((none|no|required)\)|(\S+<=?)?x(<=?|>=?)\S+").fullmatch
+_NOISE = ("default: (none)", "default: (no)", "default: (required)")
 
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
@@ -207,11 +207,11 @@ def grouped(command: click.Command, ctx: click.Context) -> list[tuple[str, list[
 
 
 def _without_noise(text: str) -> str:
-    """Help of an option without ranges and defaults that tell nothing, which Click adds in brackets."""
+    """Help of an option without defaults that tell nothing, which Click adds in brackets."""
     sentence, bracket, extra = text.rpartition("  [")
     if not bracket:
         return text
-    parts = [part for part in extra.removesuffix("]").split("; ") if not _NOISE(part)]
+    parts = [part for part in extra.removesuffix("]").split("; ") if part not in _NOISE]
     told = "; ".join(re.sub(r"^default: \((.*)\)$", r"default: \1", part) for part in parts)
     return f"{sentence}  [{told}]" if told else sentence
 
@@ -221,40 +221,31 @@ def arguments(command: click.Command) -> list[tuple[str, str]]:
     return [(str(p.metavar), p.description) for p in command.params if isinstance(p, Argument)]
 
 
-class FiniteNumber(FloatParamType):
-    """A finite number: neither nan nor infinite, and, if `positive`, greater than 0."""
+class _Number(FloatParamType):
+    """A finite number, greater than 0 if `positive`, or a `whole` number from `least` to `most`."""
 
-    def __init__(self, positive: bool = False) -> None:
-        self._positive = positive
+    def __init__(
+        self, positive: bool = False, whole: bool = False, least: int = 0, most: int | None = None
+    ) -> None:
+        self._positive, self._whole, self._least, self._most = positive, whole, least, most
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Read a number, or fail as click does."""
         try:
-            number = float(super().convert(value, param, ctx))
-        except click.BadParameter:
+            number = int(value) if self._whole else float(value)
+        except ValueError:
+            if self._whole:
+                self.fail(f"{value!r} is not a valid whole number.", param, ctx)
             why = "give a number" if str(value).startswith("-") else "give it alone, without a unit"
             self.fail(f"{value!r} is not a number; {why}.", param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         if self._positive and number <= 0:
             self.fail(f"{value!r} is not greater than 0.", param, ctx)
-        return number
-
-
-class _WholeNumber(click.IntRange):
-    """A whole number in a range."""
-
-    name = "whole number"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Read a whole number, or fail as click does."""
-        try:
-            return int(super().convert(value, param, ctx))
-        except click.BadParameter:
-            if not str(value).lstrip("+-").isdecimal():
-                raise
-            most = f"{self.min} or more" if self.max is None else f"from {self.min} to {self.max}"
+        if self._whole and not self._least <= number <= (math.inf if self._most is None else self._most):
+            most = f"{self._least} or more" if self._most is None else f"from {self._least} to {self._most}"
             self.fail(f"{value} is not possible; give {most}.", param, ctx)
+        return number
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -269,7 +260,7 @@ def number(
     name: str, metavar: str, help: str, without: str | None = None, *, positive: bool = False, **more: Any
 ) -> Callable[[F], F]:
     """An option that is a finite number, or as many as its metavar has words."""
-    return _option(name, help, without, metavar=metavar, type=FiniteNumber(positive), **more)
+    return _option(name, help, without, metavar=metavar, type=_Number(positive), **more)
 
 
 def count(
@@ -283,7 +274,8 @@ def count(
     **more: Any,
 ) -> Callable[[F], F]:
     """An option that is a whole number, or as many as its metavar has words."""
-    return _option(name, help, without, metavar=metavar, type=_WholeNumber(least, most), **more)
+    kind = _Number(whole=True, least=least, most=most)
+    return _option(name, help, without, metavar=metavar, type=kind, **more)
 
 
 def choice(name: str, words: str, help: str, without: str | None = None, **more: Any) -> Callable[[F], F]:

@@ -12,7 +12,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, noted, print_summary, say, warn, warned
-from neurocal_cli.errors import FormatError, InputError, UsageError, plural
+from neurocal_cli.errors import FormatError, UsageError, plural, value_failures
 from neurocal_cli.files.image_files import find_images, is_image, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
 
@@ -254,10 +254,8 @@ class _Work:
         for remapping, path in zip(self.remappings, pair, strict=True):
             pixels, source, notes = read_picture(path)
             note(*(f"{source}: {text}" for text in notes))
-            try:
+            with value_failures(source):
                 pictures.append(remapping(pixels))
-            except InputError as error:
-                raise InputError(f"{source}: {error}") from error
         names = [os.path.splitext(os.path.basename(path))[0] for path in pair]
         for side, name, pixels in zip(_SIDES, names, pictures, strict=True):
             self._write(os.path.join(side, f"{name}.png"), encode_image(pixels, ".png"))

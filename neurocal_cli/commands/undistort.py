@@ -22,7 +22,7 @@ from neurocal_cli.commands.streams import (
     say,
     warn,
 )
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, UsageError, value_failures
 from neurocal_cli.files.image_files import find_images, is_image
 from neurocal_cli.files.writing import make_folder, write_whole
 
@@ -325,11 +325,9 @@ class _Undistorting:
         pixels, source, notes = read_picture(path)
         self.size = self.size or (pixels.shape[1], pixels.shape[0])
         remapping = self.remapping
-        try:
+        with value_failures(source):
             corrected = remapping(pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from error
         for text in notes:
             self.notes.setdefault(text, []).append(path)
         return content

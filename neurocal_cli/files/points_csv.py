@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.table import Table, read_table
 from neurocal_cli.files.table_header import Schema, quoted_field
 from neurocal_cli.files.writing import write_whole
@@ -244,10 +244,8 @@ def _without(name: str) -> Callable[[Table], NoReturn]:
 
 def _told_apart(table: Table) -> Table:
     """The table with a view for each board in each image, and with ids of each board's points."""
-    try:
+    with value_failures(table.source):
         view, point = by_board(_views_of_file(table), table.labels.get("point"), table.labels["board"])
-    except InputError as error:
-        raise FormatError(str(error), table.source) from None
     named = {"view": view} | ({} if point is None else {"point": point})
     return replace(table, labels=table.labels | named)
 
