@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -296,7 +296,14 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
             remarks.setdefault(text, []).append(name)
     note_once(remarks)
     warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
-    warn(*_mixed_orientations(outcomes.values()))
+    turns = Counter(outcome.turned or "as stored" for outcome in outcomes.values())
+    if len(turns) > 1:  # each way of turning has its own image centre
+        counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())
+        warn(
+            f"the images have different EXIF orientations ({counts}), so their image centres differ although "
+            "they may be of one camera; remove the orientation from all files, for example with `exiftool "
+            "-Orientation= FILE`, and detect again"
+        )
     check_size(outcomes.values(), board)
     if not found and len(outcomes) == 1:
         raise NeurocalError(*problems.values())
@@ -316,16 +323,3 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
         f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
         f"{summary['n_rejected']} rejected" + (f"; {first_of(unread)} could not be read" if unread else ""),
     )
-
-
-def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
-    """Warn of images that were turned differently: each way of turning has its own image centre."""
-    turns = Counter(outcome.turned or "as stored" for outcome in outcomes)
-    if len(turns) < 2:
-        return []
-    counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())
-    return [
-        f"the images have different EXIF orientations ({counts}), so their image centres differ although "
-        "they may be of one camera; remove the orientation from all files, for example with `exiftool "
-        "-Orientation= FILE`, and detect again"
-    ]

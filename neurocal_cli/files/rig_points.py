@@ -39,28 +39,29 @@ def read_rig_points(
     InputError
         A file holds several cameras, but a name is given for it.
     """
-    tables: dict[str, list[Table]] = {}
     remarks: list[str] = [] if notes is None else notes
-    found: dict[str, Correspondences] = {}
-    order: dict[str, None] = {}  # of the cameras, as they are given
+    found: dict[str, Correspondences | list[Table]] = {}
     for name, path in files:
+        corners = None
         if path != "-" and (board is not None or not path.lower().endswith(TABLES)):
             corners = read_corners([path], board, remarks, what="points", advice=BOARD_ADVICE)
-            if corners is not None:
-                camera = name or Path(path).stem
-                if camera in found:
-                    raise InputError(f"the camera {camera} has several files of points; give one")
-                found[camera] = corners
-                order.setdefault(camera)
-                continue
-        table = read_table(path, POINTS)
-        for camera, part in _by_camera(table, name):
-            tables.setdefault(camera, []).append(part)
-            order.setdefault(camera)
-    if twice := found.keys() & tables.keys():
-        raise InputError(f"the camera {min(twice)} has several files of points; give one")
-    found |= {camera: correspondences(parts, remarks) for camera, parts in tables.items()}
-    return {camera: found[camera] for camera in order}
+        if corners is not None:
+            if found.setdefault(name or Path(path).stem, corners) is not corners:
+                raise _several(name or Path(path).stem)
+            continue
+        for camera, part in _by_camera(read_table(path, POINTS), name):
+            parts = found.setdefault(camera, [])
+            if not isinstance(parts, list):
+                raise _several(camera)
+            parts.append(part)
+    return {
+        camera: correspondences(one, remarks) if isinstance(one, list) else one
+        for camera, one in found.items()
+    }
+
+
+def _several(camera: str) -> InputError:
+    return InputError(f"the camera {camera} has several files of points; give one")
 
 
 def _by_camera(table: Table, name: str) -> list[tuple[str, Table]]:
