@@ -310,16 +310,14 @@ class _Climb:
 
     def at(self, ratios: Array) -> _Solution:
         """The solution for these sizes of the parts."""
-        return self._solution(ratios, self.system.solve(self._named(ratios)))
-
-    def _named(self, ratios: Array) -> dict[str, float]:
-        return dict(zip(self.names, ratios.tolist(), strict=True))
-
-    def _solution(self, ratios: Array, solved: Solved) -> _Solution:
+        solved = self.system.solve(self._named(ratios))
         if not solved.cost > 0:  # rounding: without a camera that fits at all, the quadratic means nothing
             raise np.linalg.LinAlgError("the least squared error is not positive")
         evidence = log_evidence(self.spare, solved.cost, solved.logdet - self.log_precision)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
+
+    def _named(self, ratios: Array) -> dict[str, float]:
+        return dict(zip(self.names, ratios.tolist(), strict=True))
 
     def limits(self, now: _Solution) -> tuple[Array, Array]:
         """(G,) least and largest ratios; the same for a part that is held."""
@@ -335,11 +333,10 @@ class _Climb:
         return size > math.sqrt(self.of_prints * self.least[0])
 
     def changed(self, now: _Solution, new: Mapping[int, float]) -> _Solution:
-        """The solution with new ratios of some parts, for which the system need not be solved again."""
+        """The solution with new ratios of some parts."""
         ratios = now.ratios.copy()
         ratios[list(new)] = list(new.values())
-        names = [self.names[part] for part in new]
-        return self._solution(ratios, now.solved.changed(self._named(ratios), names))
+        return self.at(ratios)
 
     def on_or_off(self, now: _Solution, part: int) -> _Solution:
         """The solution with or without a stretch or a lean, whichever is more probable."""

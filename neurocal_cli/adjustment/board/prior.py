@@ -250,7 +250,6 @@ class Coordinates:
 
     prior: Prior
     linear: Array  # (3 n, k - 3 n) basis of the linear parts
-    groups: dict[str, NDArray[np.intp]]  # indices of the linear parts
     vectors: Array | None  # (n, n) orthonormal eigenfunctions; None if there is no smooth part
     units: Array  # (k, G) variances for parts of size 1, which add up
 
@@ -292,14 +291,11 @@ class Coordinates:
 def coordinates_of(prior: Prior) -> Coordinates:
     """The coordinates that are independent under a prior."""
     n, m = len(prior.axes), prior.basis.shape[2]
-    groups: dict[str, NDArray[np.intp]] = {}
     places: list[NDArray[np.intp]] = []
     of_points = prior.units[m:].copy()
     vectors, values = None, np.zeros(n)
     for part, (name, columns) in enumerate(prior.groups.items()):
         if name not in _SMOOTH:
-            first = sum(map(len, places))
-            groups[name] = np.arange(first, first + len(columns))
             places.append(columns)
             continue
         functions = prior.basis[:, :, columns]
@@ -312,7 +308,7 @@ def coordinates_of(prior: Prior) -> Coordinates:
         of_points[:, part] = (values[:, None] * along).ravel()
     linear = np.concatenate([np.zeros(0, dtype=np.intp), *places])
     units = np.concatenate([prior.units[linear], of_points])
-    return Coordinates(prior, prior.basis[:, :, linear].reshape(3 * n, -1), groups, vectors, units)
+    return Coordinates(prior, prior.basis[:, :, linear].reshape(3 * n, -1), vectors, units)
 
 
 @frozen_dataclass(eq=False)

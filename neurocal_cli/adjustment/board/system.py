@@ -105,8 +105,6 @@ class Solved:
     parts: Parts
     camera: Array  # (f, f) covariance of the cameras
     joint: Callable[[], JointCovariance]
-    # The same after a change of some linear parts, with the sizes of all parts and the names of those.
-    changed: Callable[[Mapping[str, float], Sequence[str]], Solved]
 
 
 @frozen_dataclass(eq=False)
@@ -200,71 +198,18 @@ class PosesFirst:
 
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
-        M, prior = self._with_prior(ratios)
-        logprior = float(np.log(prior).sum())
+        f, coordinates, (M, variances) = self.f, self.coordinates, self._with_prior(ratios)
         root, logdet = _root_of_inverse(M)
-        half, camera = root @ self.right, root[:, : self.f]
-        x, variances = half @ root, np.einsum("ij,ij->j", root, root)
-        cost, logdet = self.given_cost - float(half @ half), logdet + self.of_poses + logprior
-
-        def covariance(factors: Array) -> Array:
-            return _squared(root[:, self.f :] @ factors)
-
-        def changed(ratios: Mapping[str, float], names: Sequence[str]) -> Solved:
-            """By the formula of Woodbury, because only a few precisions change."""
-            places = np.concatenate([self.coordinates.groups[name] for name in names])
-            after, rows = self.coordinates.variances(ratios)[places], self.f + places
-            across, gain = root.T @ root[:, rows], np.diag(1.0 / after - 1.0 / prior[places])
-            factor = np.eye(len(rows)) + gain @ across[rows]
-            inner = np.linalg.solve(factor, gain)
-            by_inner, own = across @ inner, x[rows]
-
-            def covariance_after(factors: Array) -> Array:
-                of_rows = across[self.f :].T @ factors
-                return np.asarray(covariance(factors) - of_rows.T @ inner @ of_rows)
-
-            def joint() -> JointCovariance:
-                try:  # larger variances add rows to the root of the covariance
-                    return self._joint(np.concatenate([root, np.linalg.cholesky(-inner).T @ across.T]))
-                except np.linalg.LinAlgError:
-                    return self.solve(ratios).joint()
-
-            more = np.linalg.slogdet(factor)[1] + np.log(after / prior[places]).sum()
-            return self._solved(
-                ratios,
-                x - by_inner @ own,
-                variances - (by_inner * across).sum(axis=1),
-                cost + float(own @ inner @ own),
-                logdet + float(more),
-                camera.T @ camera - by_inner[: self.f] @ across[: self.f].T,
-                covariance_after,
-                cache(joint),
-                lambda new, others: changed(new, list(dict.fromkeys([*names, *others]))),
-            )
-
-        return self._solved(
-            ratios, x, variances, cost, logdet, camera.T @ camera, covariance,
-            cache(lambda: self._joint(root)), changed,
-        )  # fmt: skip
-
-    def _solved(
-        self,
-        ratios: Mapping[str, float],
-        x: Array,
-        variances: Array,
-        cost: float,
-        logdet: float,
-        camera: Array,
-        covariance: Callable[[Array], Array],
-        joint: Callable[[], JointCovariance],
-        changed: Callable[[Mapping[str, float], Sequence[str]], Solved],
-    ) -> Solved:
-        """The solution with the unknowns x, which have these variances."""
-        f, coordinates = self.f, self.coordinates
+        half, camera, own = root @ self.right, root[:, :f], root[:, f:]
+        x = half @ root
         prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
+        parts = Parts.of(
+            prior, x[f:], np.einsum("ij,ij->j", own, own), lambda factors: _squared(own @ factors)
+        )
         return Solved(
-            x[:f], lambda: coordinates.offsets(x[f:]), cost, logdet,
-            Parts.of(prior, x[f:], variances[f:], covariance), camera, joint, changed,
+            x[:f], lambda: coordinates.offsets(x[f:]), self.given_cost - float(half @ half),
+            logdet + self.of_poses + float(np.log(variances).sum()),
+            parts, camera.T @ camera, cache(lambda: self._joint(root)),
         )  # fmt: skip
 
     def _joint(self, root: Array) -> JointCovariance:
@@ -385,7 +330,7 @@ class PointsFirst:
         return Solved(
             x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
             Parts.of(prior, unknowns, variances, covariance),
-            camera.T @ camera, joint, lambda new, _: self.solve(new),
+            camera.T @ camera, joint,
         )  # fmt: skip
 
     def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
