@@ -235,13 +235,6 @@ def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:
     return np.asarray((vectors * values.clip(min=0.0)) @ vectors.T / scale[:, None] / scale)
 
 
-def wide_covariance(entries: Array, E: Array, follow: Array, left_out: NDArray[np.bool_]) -> Array:
-    """(f, f) covariance of all free unknowns: that of the estimated ones plus the spread of the open ones."""
-    wide = follow @ E @ follow.T
-    wide[np.ix_(~left_out, ~left_out)] += entries
-    return np.asarray(wide)
-
-
 # Prior odds of a stretch, and of a small and a large lean, by its size over STRETCH. Larger odds make clean
 # data less certain. With these, the std of alpha from 3, 4, 5 and 8 views grows by 19, 5, 3 and 0.7 % in the
 # median, and that of theta by 31, 16, 12 and 4 %. Without a small lean, these are 4, 1, 0.5 and 0.1 %; but if

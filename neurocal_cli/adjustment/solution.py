@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,9 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
+
+if TYPE_CHECKING:
+    from neurocal_cli.adjustment.board.posterior import Posterior
 
 # Least ratio of the squared errors after and before, at the same minimum: the fifteen unknowns of a lens
 # explain a twentieth of 300 residuals.
@@ -74,30 +77,6 @@ class TrainingRecord:
         )
 
 
-class TargetPosterior(Protocol):
-    """What the posterior of an estimated target tells of its camera; see `adjustment.board.posterior`."""
-
-    @property
-    def variance(self) -> float:
-        """Variance of the noise [px^2]."""
-
-    @property
-    def camera(self) -> Array:
-        """(f, f) covariance of the free parameters for unit noise, with the offsets marginalised."""
-
-    @property
-    def poses(self) -> Array | None:
-        """(P, 6, 6) covariance of each pose for unit noise."""
-
-    @property
-    def followed(self) -> Array:
-        """(f, n, 3) regression of the cameras' scores on those of the offsets, along each point's axes."""
-
-    @property
-    def determined(self) -> float:
-        """Effective number of the offsets' unknowns that the data determine."""
-
-
 @frozen_dataclass(eq=False)
 class Solution:
     """Solution of a problem, in normalised units."""
@@ -121,7 +100,7 @@ class Solution:
     # The target if it was estimated with the camera; the problem's points are then those of the target.
     target: Target | None = None
     # A minimum, and a function that returns the posterior of the target there for a noise variance [px^2].
-    target_posterior: tuple[Adjusted, Callable[[float], TargetPosterior]] | None = None
+    target_posterior: tuple[Adjusted, Callable[[float], Posterior]] | None = None
     target_kept: bool = False  # whether the given target was kept although it could have been estimated
     ambiguity: Ambiguity | None = None  # other cameras that explain the points equally well
     of_all: Solution | None = None  # the fit of all points, if some were rejected afterwards

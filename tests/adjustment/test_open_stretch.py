@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.campaign import scene
-from support.rigs import random_rig
+from support.rigs import random_rig, stereo_problem
 from support.scenes import random_rotation
 from support.targets import photographed
 
@@ -18,7 +18,7 @@ from neurocal_cli.adjustment.open_choices import SpreadOfOpen, open_stretch, spr
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.rig import covariance
-from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.covariance import covariance_of_stretch
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.distortion import Distortion

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose
 from neurocal_cli.adjustment.reprojection import residuals
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import rig_problem
+from neurocal_cli.calibration.rig.frames import frames_of_pairs
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.camera.distortion import Distortion, distort
 from neurocal_cli.camera.geometry import Array
@@ -141,3 +145,9 @@ def all_residuals(problem: RigProblem, state: RigState) -> Array:
             error = error * (batches.whitening[:, :1] > 0)
         out.append(np.sqrt(seen.weight) * error.ravel())
     return np.concatenate(out)
+
+
+def stereo_problem(left: Calibration, right: Calibration, pairs: Sequence[tuple[str, str]]) -> RigProblem:
+    """Two calibrations, of which some views are paired by their names."""
+    frames = frames_of_pairs(left.points.view_names, right.points.view_names, pairs)
+    return rig_problem((left, right), frames.of_views)

@@ -17,13 +17,13 @@ from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, coun
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.reprojection import normal_blocks, pose_response
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
-from neurocal_cli.adjustment.solution import TargetPosterior
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
 if TYPE_CHECKING:
+    from neurocal_cli.adjustment.board.posterior import Posterior
     from neurocal_cli.adjustment.open_choices import OpenCoefficients
 
 # Ratios of the jackknife's variance to the one expected from noise, from which on it is used. For a bend in
@@ -43,7 +43,7 @@ class CameraSeen:
     points: Correspondences  # with the world coordinates of the estimated target, if any
     target: Target | None = None  # the estimated target
     # Function that returns the posterior of the target for a variance of the noise, if there is one already.
-    posterior: Callable[[float], TargetPosterior] | None = None
+    posterior: Callable[[float], Posterior] | None = None
     # Candidate models of the distortion selection; empty if the user named the model.
     choice: Collection[str] = ()
     shared: Array | None = None  # (f, f) covariance of the free parameters, if it comes from elsewhere
@@ -132,7 +132,8 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     left_out = richer.prior.left_out
     spread = choices.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     E, follow = spread.E, spread.follow
-    entries = choices.wide_covariance(known.found.entries, E, follow, left_out)
+    entries = follow @ E @ follow.T
+    entries[np.ix_(~left_out, ~left_out)] += known.found.entries
     if not np.isfinite(entries).all():
         return known
     poses = known.found.poses
@@ -176,7 +177,7 @@ def _basis(
     seen: CameraSeen,
     m: Minimum,
     shared: Array | None = None,
-    posterior: Callable[[float], TargetPosterior] | None = None,
+    posterior: Callable[[float], Posterior] | None = None,
 ) -> CovarianceBasis:
     if seen.target is None:
         return CovarianceBasis(m, shared, m.views.n_equations)

@@ -25,7 +25,7 @@ from neurocal_cli.adjustment.board.information import (
     joined_without_each,
     linearised,
 )
-from neurocal_cli.adjustment.board.posterior import camera_step_of, posterior_of
+from neurocal_cli.adjustment.board.posterior import Posterior, camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.board.system import WithoutPoses
@@ -33,7 +33,6 @@ from neurocal_cli.adjustment.board.validation import without_each
 from neurocal_cli.adjustment.covariance import CovarianceBasis
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import eliminate
-from neurocal_cli.adjustment.solution import TargetPosterior
 from neurocal_cli.adjustment.views import products
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.points import Correspondences
@@ -48,7 +47,7 @@ def covariance_basis(
     target: Target,
     m: Minimum,
     points: Correspondences,
-    posterior: Callable[[float], TargetPosterior] | None = None,
+    posterior: Callable[[float], Posterior] | None = None,
 ) -> CovarianceBasis:
     """Input of the covariance of a camera at its minimum, for an estimated target; see `CameraSeen`.
 

@@ -26,7 +26,6 @@ from neurocal_cli.adjustment.reprojection import (
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.evaluation import evaluate_camera
-from neurocal_cli.calibration.rig.frames import frames_of_pairs
 from neurocal_cli.calibration.rig.problem import (
     Frames,
     Observations,
@@ -81,12 +80,6 @@ def rig_problem(calibrations: Sequence[Calibration], frames: Frames) -> RigProbl
         extent=extent,
         is_flat=is_flat,
     )
-
-
-def stereo_problem(left: Calibration, right: Calibration, pairs: Sequence[tuple[str, str]]) -> RigProblem:
-    """Combine two calibrations, of which some views are paired by their names."""
-    frames = frames_of_pairs(left.points.view_names, right.points.view_names, pairs)
-    return rig_problem((left, right), frames.of_views)
 
 
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:

@@ -25,7 +25,7 @@ from neurocal_cli.calibration.rig.causes import EACH_PART, SAME_MOMENT, TAKEN, N
 from neurocal_cli.calibration.rig.consensus import NEIGHBOUR, PAIR_ANEW, SHIFTED, UNSYNCHRONISED
 from neurocal_cli.calibration.rig.edges import described, pair_name
 from neurocal_cli.calibration.rig.problem import ViewEquations
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_uncertainty import depth_std, fitted, has_points
 from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import (
@@ -85,11 +85,6 @@ def assess_rig(rig: Rig) -> Verdict | None:
         "depth_share": evidence.depth_share,
     }
     return verdict_of(_findings(rig, evidence), measures)
-
-
-def assess_stereo(rig: StereoRig) -> Verdict | None:
-    """The same for a left and a right camera."""
-    return assess_rig(of_two(rig))
 
 
 def _evidence(rig: Rig) -> _Evidence:

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
-from neurocal_cli.calibration.rig.adjust import stereo_problem
-from neurocal_cli.calibration.rig.frames import FrameNames, ViewPairs
+from neurocal_cli.calibration.rig.adjust import rig_problem
+from neurocal_cli.calibration.rig.frames import FrameNames, ViewPairs, frames_of_pairs
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -96,7 +96,7 @@ def with_shifted(problem: RigProblem, rig: Pose, faults: Mapping[Pair, str]) -> 
         moved = [pair for pair in neighbours(problem.pairs, word) if pair[0] in odd]
         if len(moved) < LEAST_AGREED:
             continue
-        shifted = stereo_problem(*_two(problem), moved)
+        shifted = _of_pairs(problem, moved)
         fits = _distance(shifted, _poses(shifted), rig.R[None], rig.t[None])[0] < 1
         if fits.sum() >= max(LEAST_AGREED, AGREED * len(moved)):
             names = [a for (a, _), one in zip(shifted.pairs, fits, strict=True) if one]
@@ -109,7 +109,7 @@ def all_shifted(problem: RigProblem) -> str:
     if len(problem.paired) < 2 * LEAST_AGREED:
         return ""
     for word in SHIFTED:
-        shifted = stereo_problem(*_two(problem), neighbours(problem.pairs, word))
+        shifted = _of_pairs(problem, neighbours(problem.pairs, word))
         reasons = find_consensus(shifted).reasons
         if reasons.count("") > AGREED * len(reasons):
             return word
@@ -157,9 +157,10 @@ def neighbours(pairs: Sequence[Pair], word: str) -> list[Pair]:
     return [(a, b) for (a, _), (_, b) in zip(first, second, strict=True)]
 
 
-def _two(problem: RigProblem) -> tuple[Calibration, Calibration]:
-    left, right = problem.calibrations
-    return left, right
+def _of_pairs(problem: RigProblem, pairs: Sequence[Pair]) -> RigProblem:
+    """The problem of the two cameras with other pairs of views."""
+    left, right = problem.names
+    return rig_problem(problem.calibrations, frames_of_pairs(left, right, pairs).of_views)
 
 
 @frozen_dataclass(eq=False)

@@ -55,15 +55,25 @@ def without_contradictions(
             (fit, warnings) if moving is fit else adjusted(moving.problem, moving.state, refine_cameras, told)
         )
 
+    def held(whole: bool) -> set[tuple[int, str]]:
+        """Suspects that fit the others after all; of the whole, all if a cause in common is more probable."""
+        suspects = {view for view, why in left_out.items() if is_suspect(why)}
+        if not suspects:
+            return suspects
+        named = {view: why for view, why in left_out.items() if view not in suspects}
+        still = at_fit(_detached(problem, named, names), fit)
+        found = named_cause(still, names, free=of_rig(still))[0] if whole else None
+        if found is not None and is_common(found, still, fit, len(suspects)):
+            return suspects
+        return suspects & set(_views(problem, fitting(still)))
+
+    def without(views: set[tuple[int, str]]) -> LeftOut:
+        return {view: why for view, why in left_out.items() if view not in views}
+
     fit, warnings = fitted()
-    if suspects := _suspects(left_out):
-        # The others tell whether the suspects have a cause in common, or which of them fit after all.
-        still = at_fit(_detached(problem, _named(left_out), names), fit)
-        found = named_cause(still, names, free=of_rig(still))[0]
-        common = found is not None and is_common(found, still, fit, len(suspects))
-        if held := suspects if common else suspects & set(_views(problem, fitting(still))):
-            left_out = {view: why for view, why in left_out.items() if view not in held}
-            fit, warnings = fitted()
+    if back := held(True):
+        left_out = without(back)
+        fit, warnings = fitted()
     if fit.problem.motion is not None and (odd := _odd_views(fit)):
         left_out = left_out | dict.fromkeys(odd, UNSYNCHRONISED)
         fit, warnings = fitted()
@@ -80,11 +90,9 @@ def without_contradictions(
             if again.text == found.text:
                 break
             found = again
-    if left_out.keys() > (suspects := _suspects(left_out)):  # without the others, some may fit
-        still = at_fit(_detached(problem, _named(left_out), names), fit)
-        if held := suspects & set(_views(problem, fitting(still))):
-            left_out = {view: why for view, why in left_out.items() if view not in held}
-            fit, warnings = fitted()
+    if not all(map(is_suspect, left_out.values())) and (back := held(False)):
+        left_out = without(back)
+        fit, warnings = fitted()
     return fit, left_out, warnings
 
 
@@ -153,16 +161,6 @@ def is_suspect(why: str) -> bool:
     Such views may have a cause in common, as all images of a late camera have.
     """
     return why == UNSYNCHRONISED or why.startswith(NEIGHBOUR)
-
-
-def _suspects(left_out: Mapping[tuple[int, str], str]) -> set[tuple[int, str]]:
-    """The other ones."""
-    return {view for view, why in left_out.items() if is_suspect(why)}
-
-
-def _named(left_out: Mapping[tuple[int, str], str]) -> dict[tuple[int, str], str]:
-    """The views with a fault that has a name."""
-    return {view: why for view, why in left_out.items() if not is_suspect(why)}
 
 
 def at_fit(problem: RigProblem, fit: RigFit) -> RigFit:

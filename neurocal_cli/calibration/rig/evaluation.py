@@ -28,7 +28,7 @@ from neurocal_cli.calibration.evaluation import (
     refuse_another_size,
     with_findings,
 )
-from neurocal_cli.calibration.rig.assessment import assess_stereo
+from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo, poses_on_rig
 from neurocal_cli.calibration.rig.frames import Pairs, frames_of_pairs, pair_points, pair_views
 from neurocal_cli.calibration.rig.rig import StereoRig, of_two
@@ -309,7 +309,7 @@ class _Evaluator:
     def _judgement(self) -> Verdict | None:
         """The verdict on the rig by its own points."""
         if self.rig is not None:
-            return assess_stereo(self.rig)
+            return assess_rig(of_two(self.rig))
         advice = ("calibrate both cameras together: neurocal stereo",)
         return Verdict("poor", (self.failure,), advice, {})
 

@@ -134,14 +134,8 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     """
     problem, state = fit.problem, fit.state
     sides = problem.calibrations[first].points, problem.calibrations[second].points
-    seen = [problem.observations[side] for side in (first, second)]
-    of_second = {
-        frame: name
-        for name, frame in zip(problem.names[second], seen[1].view.tolist(), strict=True)
-        if problem.together[frame]
-    }
-    frames = zip(problem.names[first], seen[0].view.tolist(), strict=True)
-    pairs = tuple((name, of_second[frame]) for name, frame in frames if frame in of_second)
+    two = problem.of_two(first, second)
+    pairs = tuple(two.pairs[k] for k in np.argsort(two.paired_left))
     if not pairs:
         return np.zeros(0), np.zeros(0)
     try:

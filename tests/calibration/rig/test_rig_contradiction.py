@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.rigs import RigScene, random_rig
+from support.rigs import RigScene, random_rig, stereo_problem
 from support.slow_cases import slow_but
 from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
 from neurocal_cli import Correspondences, calibrate, fit_stereo
 from neurocal_cli.adjustment.covariance import not_smaller
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter, stereo_problem
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
 from neurocal_cli.calibration.rig.causes import Named, named_cause
 from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.edges import RelativePoses, odd_pairs, relative_poses

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.rigs import KINDS, RigScene, all_residuals, corner, random_rig, sides
+from support.rigs import KINDS, RigScene, all_residuals, corner, random_rig, sides, stereo_problem
 from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
 from neurocal_cli import StereoRig, calibrate
-from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.geometry import Array

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from support.rigs import RigScene, all_residuals, random_rig
+from support.rigs import RigScene, all_residuals, random_rig, stereo_problem
 from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
-from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
