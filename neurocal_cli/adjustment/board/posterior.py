@@ -246,7 +246,8 @@ def minimum_of(
 ) -> tuple[Array, Array]:
     """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances."""
     noise = math.sqrt(variance)
-    return system_of(info, prior).minimum({name: size / noise for name, size in sizes.items()})
+    solved = system_of(info, prior).solve({name: size / noise for name, size in sizes.items()})
+    return solved.camera_step, solved.offsets()
 
 
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
@@ -257,8 +258,8 @@ def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[flo
     system = system_of(info, prior)
 
     def at(ratio: float) -> tuple[float, float]:
-        cost, logdet = system.least({STATED: ratio})
-        return max(cost, _NO_COST), logdet
+        solved = system.solve({STATED: ratio})
+        return max(solved.cost, _NO_COST), solved.logdet
 
     return at
 
@@ -359,8 +360,8 @@ class _Climb:
                 continue
             on = self.changed(now, {part: self.of_prints / noise})
             # In units of the prior's variance.
-            v = max(1.0 - float(on.solved.parts.determined[part]), _LEAST_SHARE)
-            squared = float(on.solved.parts.squares[part]) / on.variance
+            v = max(1.0 - float(on.solved.parts().determined[part]), _LEAST_SHARE)
+            squared = float(on.solved.parts().squares[part]) / on.variance
             p = 1.0 / (1.0 + math.exp(min(now.evidence - on.evidence, _CERTAIN)))
             precision = 1.0 / (p * (v + squared)) - (1.0 / v - 1.0)
             share = 1.0 / math.sqrt(precision) if precision > 1.0 else 1.0
@@ -389,7 +390,7 @@ class _Climb:
         It is Newton's step, damped where the slope is large. Growing sizes take it in their inverse squares,
         in which the evidence of a part that the data determine is nearly a quadratic.
         """
-        parts, (least, most) = now.solved.parts, self.limits(now)
+        parts, (least, most) = now.solved.parts(), self.limits(now)
         squares = parts.squares / now.variance
         slope = squares - parts.determined
         H = 2 * (parts.coupling / now.variance - np.outer(squares, squares) / self.spare)
@@ -425,7 +426,7 @@ class _Climb:
             camera_step=solved.camera_step,
             camera=solved.camera,
             sizes=self._named(now.ratios * noise),
-            determined=float(solved.parts.determined.sum()),
+            determined=float(solved.parts().determined.sum()),
             evidence=now.evidence,
             joint=(solved.joint, self.gauge),
             with_open=with_open,

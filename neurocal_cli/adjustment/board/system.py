@@ -102,7 +102,7 @@ class Solved:
     offsets: Callable[[], Array]  # (n, 3) whole offsets
     cost: float
     logdet: float  # log determinant of the whole matrix over that of the prior's precisions
-    parts: Parts
+    parts: Callable[[], Parts]
     camera: Array  # (f, f) covariance of the cameras
     joint: Callable[[], JointCovariance]
 
@@ -202,14 +202,16 @@ class PosesFirst:
         root, logdet = _root_of_inverse(M)
         half, camera, own = root @ self.right, root[:, :f], root[:, f:]
         x = half @ root
-        prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
-        parts = Parts.of(
-            prior, x[f:], np.einsum("ij,ij->j", own, own), lambda factors: _squared(own @ factors)
-        )
+
+        def parts() -> Parts:
+            prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
+            variances = np.einsum("ij,ij->j", own, own)
+            return Parts.of(prior, x[f:], variances, lambda factors: _squared(own @ factors))
+
         return Solved(
             x[:f], lambda: coordinates.offsets(x[f:]), self.given_cost - float(half @ half),
             logdet + self.of_poses + float(np.log(variances).sum()),
-            parts, camera.T @ camera, cache(lambda: self._joint(root)),
+            cache(parts), camera.T @ camera, cache(lambda: self._joint(root)),
         )  # fmt: skip
 
     def _joint(self, root: Array) -> JointCovariance:
@@ -250,17 +252,6 @@ class PosesFirst:
         noise = max(squares[0], _LEAST_NOISE * cost / spare)
         return np.asarray(np.sqrt(np.maximum(squares[1:], -_UNSURE * squares[1:]) / noise))
 
-    def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
-        """Cost and log determinant of `Solved`, without the rest."""
-        M, prior = self._with_prior(ratios)
-        cost, logdet = _least(M, self.right, self.given_cost)
-        return cost, logdet + self.of_poses + float(np.log(prior).sum())
-
-    def minimum(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
-        """Step (f,) of the cameras and offsets (n, 3) of `Solved`, without the rest."""
-        x = np.asarray(np.linalg.solve(self._with_prior(ratios)[0], self.right))
-        return x[: self.f], self.coordinates.offsets(x[self.f :])
-
 
 class PointsFirst:
     """The system with the points eliminated: cameras, coefficients of the smooth parts and poses.
@@ -298,7 +289,6 @@ class PointsFirst:
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
         by_camera, right = info.by_camera[..., :-1], info.by_camera[..., -1:]
         self.by_point = np.concatenate([by_camera, by_basis, poses, right], axis=2)
-        self.rows = np.empty_like(self.by_point)  # large arrays are quicker to fill again than to allocate
 
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
@@ -309,43 +299,31 @@ class PointsFirst:
         x, back = half @ root, np.swapaxes(own_root, 1, 2)
         # Back-substitution of the points: their response to all other unknowns.
         e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
-        follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
-        camera, smooth, single, own = root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root
+        camera, smooth, own = root[:, :f], root[:, f:s], back @ own_root
+        single = cache(lambda: root @ -(back @ rows[:, :, :-1]).reshape(3 * n, len(x)).T)
 
         def joint() -> JointCovariance:
-            offsets = single + smooth @ self.prior.basis.reshape(3 * n, -1).T
+            offsets = single() + smooth @ self.prior.basis.reshape(3 * n, -1).T
             poses = root[:, s:].reshape(len(x), P, p)[:, :, :6].transpose(1, 2, 0)
             return JointCovariance(camera, offsets, own, lambda: [(np.arange(P), np.zeros((P, 6, 6)), poses)])
 
-        free = np.concatenate([smooth, single], axis=1)
-        variances = np.einsum("ij,ij->j", free, free)
-        variances[s - f :] += np.diagonal(own, axis1=1, axis2=2).ravel()
+        def parts() -> Parts:
+            free = np.concatenate([smooth, single()], axis=1)
+            variances = np.einsum("ij,ij->j", free, free)
+            variances[s - f :] += np.diagonal(own, axis1=1, axis2=2).ravel()
 
-        def covariance(factors: Array) -> Array:
-            of_points = factors[s - f :].reshape(n, 3, -1)
-            return _squared(free @ factors) + np.tensordot(of_points, own @ of_points, axes=((0, 1), (0, 1)))
+            def covariance(factors: Array) -> Array:
+                of_points = factors[s - f :].reshape(n, 3, -1)
+                by_points = np.tensordot(of_points, own @ of_points, axes=((0, 1), (0, 1)))
+                return _squared(free @ factors) + by_points
 
-        unknowns = np.concatenate([x[f:s], e.ravel()])
-        prior = self.prior.units * self.prior.as_array(ratios) ** 2
+            prior = self.prior.units * self.prior.as_array(ratios) ** 2
+            return Parts.of(prior, np.concatenate([x[f:s], e.ravel()]), variances, covariance)
+
         return Solved(
             x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
-            Parts.of(prior, unknowns, variances, covariance),
-            camera.T @ camera, joint,
+            cache(parts), camera.T @ camera, joint,
         )  # fmt: skip
-
-    def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
-        """Cost and log determinant of `Solved`, without the rest."""
-        M, _, _, logdet = self._without_points(ratios)
-        cost, of_rest = _least(M[:-1, :-1], M[:-1, -1], float(M[-1, -1]))
-        return cost, logdet + of_rest
-
-    def minimum(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
-        """Step (f,) of the cameras and offsets (n, 3) of `Solved`, without the rest."""
-        M, root, rows, _ = self._without_points(ratios)
-        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
-        own = rows[:, :, -1] - rows[:, :, :-1] @ x
-        single = (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
-        return x[: self.f], np.asarray(self.prior.basis @ x[self.f : self.s] + single)
 
     def _without_points(self, ratios: Mapping[str, float]) -> tuple[Array, Array, Array, float]:
         """The bordered matrix of all other unknowns; roots and rows of the points.
@@ -355,7 +333,7 @@ class PointsFirst:
         of_smooth, of_single = self.prior.variances(ratios)
         own = self.info.point + np.eye(3) / of_single[:, :, None]
         root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
-        rows = np.matmul(root, self.by_point, out=self.rows)
+        rows = root @ self.by_point
         flat = rows.reshape(3 * self.n, -1)
         M = self.bordered - flat.T @ flat
         at = np.arange(self.f, self.s)
@@ -367,13 +345,6 @@ class PointsFirst:
 def _squared(rows: Array) -> Array:
     """Products of the columns."""
     return np.asarray(rows.T @ rows)
-
-
-def _least(M: Array, right: Array, cost: float) -> tuple[float, float]:
-    """Cost at the minimum of a quadratic, and the log determinant of its matrix."""
-    root, logdet = _root_of_inverse(M)
-    part = root @ right
-    return cost - float(part @ part), logdet
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
