@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from test_other_programs import POINT, check, rotated
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError
+from neurocal_cli.errors import FormatError, NeurocalError
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.reading import read_cameras, read_points_or_cameras
 
@@ -733,6 +735,22 @@ def oak(socket: int, to: int, t: list[float]) -> list[Any]:
     return [socket, one]
 
 
+def mc_calib(*poses: list[list[float]], group: int = 0) -> dict[str, Any]:
+    cameras = {
+        f"camera_{k}": {
+            "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": FLAT},
+            "distortion_vector": {"rows": 1, "cols": 5, "dt": "d", "data": D5},
+            "distortion_type": 0,
+            "camera_group": k * group,
+            "img_width": 640,
+            "img_height": 480,
+            "camera_pose_matrix": {"rows": 4, "cols": 4, "dt": "d", "data": np.ravel(pose).tolist()},
+        }
+        for k, pose in enumerate(poses)
+    }
+    return {"nb_camera": len(poses), **cameras}
+
+
 def calib_io(r: list[float], t: list[float]) -> Any:
     (one,) = MET["calib.io"][0]["Calibration"]["cameras"]
     turn, shift = dict(zip(("rx", "ry", "rz"), r, strict=True)), dict(zip("xyz", t, strict=True))
@@ -810,6 +828,11 @@ RIGS: dict[str, tuple[Any, list[float], list[Array]]] = {
         },
         D5,
         [TURNED, np.array(R) @ TURNED + SHIFT],
+    ),
+    "MC-Calib": (
+        mc_calib(EYE, np.linalg.inv(np.vstack([np.column_stack([R, SHIFT]), EYE[3]])).tolist()),
+        D5,
+        [TURNED],
     ),
     "OAK": (
         {"boardName": "x", "cameraData": [oak(2, 1, SHIFT), oak(1, 0, SHIFT), oak(0, -1, [0, 0, 0])]},
@@ -900,6 +923,7 @@ def test_the_fov_of_dso_becomes_the_nearest_fisheye(tmp_path: Path) -> None:
 MANY = [{"camera_intrinsic": [[1266.4 + k, 0, 816.2], [0, 1266.4, 491.5], [0, 0, 1]]} for k in range(3)]
 REFUSED: dict[str, tuple[Any, str]] = {
     "nuScenes": (MANY, "holds several cameras (0, 1, 2)"),
+    "groups of MC-Calib": (mc_calib(EYE, EYE, group=1), "have no pose between them; save one as a file"),
     "no size": ({"camera_angle_x": 0.69, "frames": [frame(1)]}, "give --image-size W H"),
     "VINS-Fusion": ('%YAML:1.0\ncam0_calib: "a.yaml"\nbody_T_cam0: 1\n', "names the files of its cameras"),
     "one focal length and a ratio": (
@@ -1035,6 +1059,17 @@ def test_what_cannot_be_read_is_named(kind: str, tmp_path: Path) -> None:
         read_points_or_cameras([written(content, tmp_path)])
     assert message in str(caught.value)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("start", ["# a\n\n", "\n", "-", "1 ", " ", "[", "a = 1\n", "'"])
+def test_the_time_to_refuse_a_file_does_not_explode_with_its_length(start: str, tmp_path: Path) -> None:
+    path = tmp_path / "notes.toml"
+    for end in ("", "\n!", "\nA sentence: it ends here."):
+        path.write_text(50 * start + end)
+        began = time.process_time()
+        with contextlib.suppress(NeurocalError):
+            read_points_or_cameras([path])
+        assert time.process_time() - began < 2
 
 
 def test_the_camera_in_a_photograph_of_a_dji_is_read(tmp_path: Path) -> None:

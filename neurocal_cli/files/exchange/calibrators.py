@@ -1,4 +1,4 @@
-"""Formats of calibration programs: Kalibr, mrcal, BoofCV, multical, calib.io and OpenICC.
+"""Formats of calibration programs: Kalibr, mrcal, BoofCV, multical, MC-Calib, calib.io and OpenICC.
 
 Kalibr's camchains have lengths in metres, and ``T_cn_cnm1`` maps points from the previous camera to this one.
 The centre of the top-left pixel is (0, 0), because Kalibr uses OpenCV's corners. Parameters of the camera
@@ -166,6 +166,34 @@ MULTICAL = Format(
     pose=_A_TO_B,
     metres=True,
     rig="`camera_poses`, `a_to_b` from b to a",
+)
+
+
+# MC-Calib: each camera is posed in the frame of the first of its group.
+def _mc_calib_parts(document: Document) -> dict[str, Field]:
+    parts = {name: part for name, part in document.root.entries().items() if name.startswith("camera_")}
+    if len({part["camera_group"].integer() for part in parts.values()}) > 1:
+        raise InputError(
+            "holds groups of cameras that share no view, and have no pose between them; save one as a file"
+        )
+    return parts
+
+
+MC_CALIB = Format(
+    "MC-Calib",
+    "camera_matrix:data",
+    """
+    0: plumb_bob distortion_vector
+    1: fisheye distortion_vector
+    2: double_sphere distortion_vector
+    """,
+    model="distortion_type",
+    size="img_width,img_height",
+    told="nb_camera camera_0",
+    files="calibrated_cameras_data.yml",
+    parts=_mc_calib_parts,
+    pose=PoseKeys("camera_pose_matrix", back=True, needed=True),
+    rig="`camera_pose_matrix` from each camera to the first",
 )
 
 # Calibrator of calib.io, whose entries are below those of its C++ classes.

@@ -54,7 +54,9 @@ KALIBR_REPORT = (
 )
 """How the report of Kalibr begins, which is read neither as points nor as cameras, and what to do."""
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
-_SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
+_SECTION = re.compile(
+    r"\A(?:[^\S\n]*(?:[#;][^\n]*)?\n)*[^\S\n]*\[[^\]\n,]+\][^\S\n]*(?:[#;][^\n]*)?(?:\n|\Z)"
+).match
 _ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)
 # name = numbers or name: numbers, as programs print them and scripts state them.
 _STATED = re.compile(

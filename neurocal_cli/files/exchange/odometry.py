@@ -241,7 +241,7 @@ VIKIT = Format(
 # DSO: a line of the model and its numbers, and a line of the size of the images. A principal point below 1 is
 # relative to it, with the first pixel at 1/2. FOV with omega = 0 is a pinhole.
 _DSO_LINES = re.compile(
-    r"\A(?:(Pinhole|RadTan|EquiDistant|KannalaBrandt|FOV)\s)?((?:\s*[-+.\deE]+){5,8})"
+    r"\s*(?:(Pinhole|RadTan|EquiDistant|KannalaBrandt|FOV)\s+)?((?:[-+.\deE]+\s+){4,7}[-+.\deE]+)"
     r"[ \t]*\n\s*(\d+[ \t]+\d+)\s*\n(?:crop|full|none|fillImg|[-+.\d])"
 ).match
 
