@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
 
+_EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of noise-free images
 _TO_GREY = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}  # by the number of channels
 
 
@@ -55,6 +56,13 @@ def grey_image(image: NDArray[Any]) -> NDArray[Any]:
     if not colours:
         return image
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), _TO_GREY[colours]))
+
+
+def least_variance(image: NDArray[np.generic]) -> float:
+    """Least variance of the pixels of an image: that of rounding, hardly any for images of real numbers."""
+    if np.issubdtype(image.dtype, np.integer):
+        return 1 / 12
+    return (_EXACT * float(np.abs(image).max())) ** 2 + _TINY
 
 
 def negative(image: NDArray[Any]) -> NDArray[Any]:

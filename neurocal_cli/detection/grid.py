@@ -56,6 +56,18 @@ class Grid:
         )
 
 
+def weights_within(places: Array) -> Array:
+    """Weights (K, 4) of the vertices (0, 0), (1, 0), (0, 1) and (1, 1) for places (K, 2) in their square."""
+    x, y = places.T
+    return np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+
+
+def squares_of(pixels: Array) -> Array:
+    """(rows - 1, cols - 1, 4, 2) the vertices of the squares of a grid (rows, cols, 2), ordered as above."""
+    p = pixels
+    return np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]], axis=2)
+
+
 _OF_POINTS = ("kind", "index", "pixels", "covariance", "across")  # of `Measured`, a row per point
 
 

@@ -53,6 +53,7 @@ from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_grid, fit_rim
 from neurocal_cli.detection.fitting.map_fit import select_map
 from neurocal_cli.detection.fitting.strips import GridEdges, GridImage, grid_lines
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
+from neurocal_cli.detection.grey import least_variance
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
@@ -61,8 +62,6 @@ from neurocal_cli.observations.measured_directions import variance_across
 
 Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
 
-_ROUNDING = 1 / 12  # DN^2
-_EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance assumed for noise-free images
 _FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides, and number of samples
 # Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
 # 0.7 to 1.6 in rendered images (test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
@@ -89,8 +88,7 @@ def measure(
     whose fits are rejected are left out.
     """
     light = image if gamma is None else linearised(image, gamma)
-    whole = np.issubdtype(light.dtype, np.integer)
-    floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
+    floor = least_variance(light)
     grid_image = GridImage(light, grid, floor)
     vertices = np.full(grid.pixels.shape, np.nan)
     if len(grid_image.edges.index) == 0:

@@ -17,7 +17,7 @@ from neurocal_cli.detection import Grid
 from neurocal_cli.detection.finding import saddles as find_levels
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.lattice import Lattice
-from neurocal_cli.detection.finding.links import find_links, find_seeds_3x3, lattice_from_links
+from neurocal_cli.detection.finding.links import find_links, find_seeds, lattice_from_links
 from neurocal_cli.detection.finding.overlaps import largest_second_difference, split_at_folds
 from neurocal_cli.detection.finding.saddles import Level, levels_of, refine_saddles
 from neurocal_cli.simulation.rendering import PlaneTruth, ground_truth
@@ -356,7 +356,7 @@ def linked_first(level: Level) -> Lattice | None:
     """What is linked with the best seed of a level."""
     links = find_links(level)
     assert links is not None
-    seeds = find_seeds_3x3(links)
+    seeds = find_seeds(links)
     none = np.zeros(len(links.saddles), dtype=bool)
     return lattice_from_links(level, links, int(seeds[0, 1, 1]), none)
 
@@ -379,7 +379,7 @@ def test_links_do_not_lead_over_a_fold(seed: int) -> None:
     level = levels_of(shot.image)[-1]
     links = find_links(level)
     assert links is not None
-    seeds = find_seeds_3x3(links)
+    seeds = find_seeds(links)
     none = np.zeros(len(links.saddles), dtype=bool)
     together = [lattice_from_links(level, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
     assert any(together)

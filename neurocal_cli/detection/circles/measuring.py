@@ -48,7 +48,7 @@ from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Single, packed
-from neurocal_cli.detection.grey import eight_bits
+from neurocal_cli.detection.grey import eight_bits, least_variance
 from neurocal_cli.detection.grid import VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.medians import upper_median
@@ -367,9 +367,6 @@ def _shading(at: SmoothMap, places: Array, fit: BatchFit, good: NDArray[np.bool_
     return fit_shading(at.frame, dark, light)
 
 
-_ROUNDING = 1 / 12  # DN^2
-
-
 def locate_circles(board: Board, image: NDArray[np.generic]) -> Identified:
     """Locate a board of circles.
 
@@ -406,5 +403,5 @@ def locate_circles(board: Board, image: NDArray[np.generic]) -> Identified:
 def measure_located(image: NDArray[np.generic], plane: CirclePlane, placed: PlacedCircles) -> Measured:
     """Measure the circles that were located in an image."""
     light = np.asarray(image, dtype=np.float32)
-    floor = _ROUNDING if image.dtype.kind in "iu" else (1e-5 * float(np.abs(light).max())) ** 2 + 1e-30
-    return measure_circles(light.max() - light if placed.light else light, plane, placed, floor)
+    dark = light.max() - light if placed.light else light
+    return measure_circles(dark, plane, placed, least_variance(image))

@@ -26,12 +26,10 @@ from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.links import (
     Links,
     find_links,
-    find_seeds_2x3,
-    find_seeds_3x3,
+    find_seeds,
     lattice_from_links,
 )
 from neurocal_cli.detection.finding.overlaps import (
-    any_overlap,
     drop_duplicates,
     merge_lattices,
     split_at_folds,
@@ -39,7 +37,7 @@ from neurocal_cli.detection.finding.overlaps import (
 )
 from neurocal_cli.detection.finding.saddles import Level, dense_parts, interpolate, levels_of, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
-from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.grid import Grid, squares_of, weights_within
 
 Size = tuple[int, int]
 
@@ -51,7 +49,7 @@ _SEARCHED = 1.4e6
 _MOST_SEARCHED = 30_000_000
 # Insensitive. Number of seeds of a level that may fail; limits the time if there is no board
 # (test_detection_speed.py, "clutter only").
-_TRIES, _TRIES_2X3 = 8, 4
+_TRIES = 8
 _BEHIND = 3.0  # ratio of the squares' sizes above which a second board is not searched
 
 
@@ -134,7 +132,7 @@ def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
     """Drop duplicates, split lattices at folds, and join the parts of occluded ones."""
     result = []
     several = drop_duplicates(lattices)
-    if any_overlap(several):
+    if len(several) > 1:
         several = [part for x in trim_overlaps(several) for part in _boards(remove_outliers(level, x))]
     for lattice in several:
         planes = [part for part in split_at_folds(lattice) if has_block(part)]
@@ -162,39 +160,22 @@ def _find_small(level: Level, coarse: Level, wanted: frozenset[Size]) -> list[La
 
 
 def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size]) -> list[Lattice]:
-    """Find further grids in a level; the first grid of an image gets more effort."""
-    seeds = find_seeds_3x3(links)
-    dark = np.zeros(len(seeds), dtype=np.intp)
-    found = _grow_from_seeds(level, links, seeds, dark, _TRIES, known, wanted)
-    if not found and not known and level.scale == 1:
-        found = _grow_from_seeds(level, links, *find_seeds_2x3(links), _TRIES_2X3, known, wanted)
-    return found
-
-
-def _grow_from_seeds(
-    level: Level,
-    links: Links,
-    seeds: NDArray[np.intp],
-    dark: NDArray[np.intp],
-    tries: int,
-    known: list[Lattice],
-    wanted: frozenset[Size],
-) -> list[Lattice]:
-    """Grow grids from seeds, until `tries` seeds have failed."""
+    """Grow further grids in a level from seeds, until some of these have failed."""
+    seeds, tries = find_seeds(links), _TRIES
     found: list[Lattice] = []
     saddles = links.saddles
     free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
     nearest = _nearest_whole(known, wanted)
     sides = _sides(saddles.points[seeds]) if wanted and len(seeds) else np.full(len(seeds), np.inf)
-    for seed, parity, side in zip(seeds, dark, sides.tolist(), strict=True):
+    for seed, side in zip(seeds, sides.tolist(), strict=True):
         if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
-        lattice = lattice_from_links(level, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
+        lattice = lattice_from_links(level, links, int(seed[1, 1]), taken)
         if lattice is not None and lattice.seen.all() and level.scale > 1:
             grid = lattice  # finer levels complete it
         else:
-            first = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
+            first = Lattice(saddles.points[seed], saddles.contrast[seed], 0)
             grid = remove_outliers(level, grow(level, first if lattice is None else lattice))
         boards = [x for x in _boards(grid) if is_smooth(level, x)]
         if boards:
@@ -211,14 +192,13 @@ def _grow_from_seeds(
 
 def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     """Find grids whose squares are too narrow to measure the directions of their edges."""
-    part = stretch(level, links.saddles.points)
-    links_of_part = None if part is None else find_links(part.level)
-    if part is None or links_of_part is None:
+    part, back = stretch(level, links.saddles.points) or (level, np.eye(2, 3))
+    links_of_part = None if part is level else find_links(part)
+    if links_of_part is None:
         return []
     found = []
-    for lattice in _find_new(part.level, links_of_part, [], frozenset()):
-        pixels = np.full_like(lattice.pixels, np.nan)
-        pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
+    for lattice in _find_new(part, links_of_part, [], frozenset()):
+        pixels = lattice.pixels @ back[:, :2].T + back[:, 2]
         grid = grow(level, refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
         found += _boards(remove_outliers(level, grid))
     return found
@@ -245,8 +225,7 @@ def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
     """Mask of the squares of grids, with a margin around them."""
     mask = np.zeros(level.image.shape, dtype=np.uint8)
     for lattice in lattices:
-        p = lattice.pixels
-        quads = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2).reshape(-1, 4, 2)
+        quads = squares_of(lattice.pixels)[:, :, [0, 1, 3, 2]].reshape(-1, 4, 2)
         quads = quads[np.isfinite(quads).all(axis=(1, 2))]
         thickness = max(1, round(0.4 * lattice.width))
         whole = np.rint(quads).astype(np.int32)
@@ -264,21 +243,12 @@ _FEWEST = 4
 _RAYS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]])  # last four: corners
 _STEPS = np.linspace(0, 0.5, 21)  # of the square's side
 _PLACES = 0.5 + _RAYS[:, None] * _STEPS[:, None]  # (8, 21, 2) in the unit square
-_CORNERS = np.stack(
-    [
-        (1 - _PLACES[..., 0]) * (1 - _PLACES[..., 1]),
-        _PLACES[..., 0] * (1 - _PLACES[..., 1]),
-        (1 - _PLACES[..., 0]) * _PLACES[..., 1],
-        _PLACES[..., 0] * _PLACES[..., 1],
-    ],
-    axis=-1,
-).reshape(-1, 4)
+_CORNERS = weights_within(_PLACES.reshape(-1, 2))
 
 
 def between_round_marks(level: Level, lattice: Lattice) -> bool:
     """Whether the squares of one colour are round, so that the lattice is no chessboard."""
-    p = lattice.pixels
-    quads = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]], axis=2)
+    quads = squares_of(lattice.pixels)
     known = np.isfinite(quads).all(axis=(2, 3))
     row, col = np.nonzero(known)
     centre, beside = np.zeros((2, known.shape[0] + 2, known.shape[1] + 2))

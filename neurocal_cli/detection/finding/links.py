@@ -130,7 +130,7 @@ def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> N
     return seen & back
 
 
-def find_seeds_3x3(links: Links) -> Index:
+def find_seeds(links: Links) -> Index:
     """Find blocks of four closed squares around a vertex, the most regular first.
 
     Returns saddles (S, 3, 3); ``[.., r, c]`` with c along port 0 of the middle saddle and r along port 1.
@@ -169,26 +169,6 @@ def _irregularity(grid: Array) -> Array:
             across = (c[:, None, 0] * part[..., 1] - c[:, None, 1] * part[..., 0]) / area
             worst = np.maximum(worst, weight * np.maximum(np.abs(along), np.abs(across)).max(axis=1))
     return worst
-
-
-def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
-    """Find blocks of two closed squares side by side, the most regular first.
-
-    Returns saddles (S, 2, 3), and whether each block is dark (S,) as in `Lattice`.
-    """
-    closed = _closed(links)
-    middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))
-    right, down, left = (links.to[middle, (p + k) % 4] for k in range(3))
-    # The outer vertices of the first and the second square.
-    corner = links.to[right, (links.port[middle, p] - 1) % 4]
-    other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
-    block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
-    grid = links.saddles.points[block]
-    c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
-    second = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
-    irregularity = second / np.maximum(np.hypot(*c.T), 1e-6)
-    order = np.argsort(irregularity, kind="stable")
-    return block[order], (p[order] + 1) % 2
 
 
 def whole_blocks(links: Links) -> Index:

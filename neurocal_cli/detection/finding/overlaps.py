@@ -9,8 +9,6 @@ a fold they jump: at one vertex if the fold goes through it, otherwise at the tw
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
@@ -26,7 +24,6 @@ _MEETS = 0.13  # squares; greatest distance of a vertex from another lattice or 
 _MEETS_PARTLY = 0.22  # ... and the same for vertices of incomplete rows
 _MOSTLY = 0.6  # share of such vertices above which a row is removed
 _COPY = 0.5  # share of vertices in another lattice above which a lattice is its copy
-_BESIDE = 2.0  # squares; lattices farther apart share no vertices
 # test_finding.py divides a board into two halves with these limits, and expects one grid.
 _NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
@@ -58,20 +55,6 @@ def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
         if not any((distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
             kept.append(lattice)
     return kept
-
-
-def any_overlap(lattices: list[Lattice]) -> bool:
-    """Whether any two lattices are near enough to share vertices."""
-    boxes = []
-    for lattice in lattices:
-        p, points = lattice.pixels, lattice.pixels[lattice.seen]
-        sides = np.concatenate([np.diff(p, axis=0).reshape(-1, 2), np.diff(p, axis=1).reshape(-1, 2)])
-        room = _BESIDE * float(np.nanmax(np.hypot(*sides.T)))
-        boxes.append((points.min(axis=0) - room, points.max(axis=0) + room))
-    return any(
-        bool(((low <= other_high) & (other_low <= high)).all())
-        for (low, high), (other_low, other_high) in combinations(boxes, 2)
-    )
 
 
 def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:

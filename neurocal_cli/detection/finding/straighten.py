@@ -199,10 +199,11 @@ def refined(level: Level, lattice: Lattice, sigma: Array | float, most: float) -
     return replace(lattice, pixels=pixels)
 
 
-def stretch(level: Level, saddles: Array) -> Stretched | None:
+def stretch(level: Level, saddles: Array) -> tuple[Level, Array] | None:
     """Stretch the surroundings of saddles (N, 2) [px] across the direction of most edges.
 
-    None if the saddles cover too much of the image, or the edges have no main direction.
+    Also returns the affine map (2, 3) from pixels of the stretched part to those of the level. None if the
+    saddles cover too much of the image, or the edges have no main direction.
     """
     height, width = level.image.shape
     away = np.hypot(*(saddles - np.median(saddles, axis=0)).T)
@@ -224,16 +225,5 @@ def stretch(level: Level, saddles: Array) -> Stretched | None:
     size = np.ceil(np.ptp(corners, axis=0)).astype(int).tolist()
     forth = np.concatenate([turn, shift[:, None]], axis=1)
     part = cv2.warpAffine(level.image, forth, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return Stretched(Level(np.asarray(part, dtype=np.float32), 1), forth)
-
-
-@frozen_dataclass(eq=False)
-class Stretched:
-    """A part of a level, stretched, with its own pixel coordinates."""
-
-    level: Level
-    forth: Array  # (2, 3) affine map from pixels of the original to those of the part
-
-    def back(self, points: Array) -> Array:
-        """Map points (..., 2) of the part to the original [px]."""
-        return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)
+    back = np.asarray(cv2.invertAffineTransform(forth), dtype=float)
+    return Level(np.asarray(part, dtype=np.float32), 1), back

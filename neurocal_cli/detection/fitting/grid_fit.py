@@ -166,12 +166,34 @@ def fit_from(
     levels: tuple[Array, Array],
     noise: float,
 ) -> GridFit:
-    """Run the stages after the first look at the edges.
+    """Fit edges with independent levels, the map through them, and all again with what they have in common.
 
     The look gives their map with the residuals of their offsets, blur [px], shading, mean level and half
     contrast of each edge, two arrays (E,), and the noise of a pixel [DN^2].
     """
-    first = _first_fit(grid_image, mapped, sigma, shading, levels, max(noise, grid_image.floor))
+    noise = max(noise, grid_image.floor)
+    lines = grid_image.edges.lines(mapped.map)
+    offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
+    fit = fit_initial(grid_image, lines, offset, sigma, shading, levels, noise)
+    good = is_typical(fit, lines.middle)
+    variance = fit.covariance[:, OFFSET, OFFSET]
+    good &= variance > 0
+    variance = np.where(good, variance, ANCHOR**2)
+    # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
+    index = mapped.model_index
+    models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
+    shifts = EdgeShifts.of(board_blur(fit, lines, good, mapped.map), shading, lines)
+    # Only large shifts matter here; those of paper boards would cost a tenth of the time.
+    chosen, shifts, observations = _selected(
+        grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
+    )
+    if _may_be_wide(chosen, grid_image.vertices):
+        wide = _wide_if_better(grid_image, chosen, observations)
+        # An uneven board departs from both maps.
+        chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
+    good &= chosen.weight[: len(good)] > 0
+    noises = PixelNoise(noise, noise, noise)
+    first = GridFit(grid_image, lines, fit, chosen, shifts, shading, noises, good)
     return fit_again(grid_image, first)
 
 
@@ -207,39 +229,6 @@ def _by_moments(
     observations = grid_image.observations(lines, offset, variance, np.ones((len(offset), 1)))
     profile = edge_profile(strips.d, strips.value, strips.inside, offset, *levels)
     return fit_map(found.map, observations, found.shift), sigma, levels, profile
-
-
-def _first_fit(
-    grid_image: GridImage,
-    mapped: MapFit,
-    sigma: float,
-    shading: Shading,
-    levels: tuple[Array, Array],
-    noise: float,
-) -> GridFit:
-    """Fit edges with independent levels, and the map through them."""
-    lines = grid_image.edges.lines(mapped.map)
-    offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    fit = fit_initial(grid_image, lines, offset, sigma, shading, levels, noise)
-    good = is_typical(fit, lines.middle)
-    variance = fit.covariance[:, OFFSET, OFFSET]
-    good &= variance > 0
-    variance = np.where(good, variance, ANCHOR**2)
-    # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
-    index = mapped.model_index
-    models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
-    shifts = EdgeShifts.of(board_blur(fit, lines, good, mapped.map), shading, lines)
-    # Only large shifts matter here; those of paper boards would cost a tenth of the time.
-    chosen, shifts, observations = _selected(
-        grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
-    )
-    if _may_be_wide(chosen, grid_image.vertices):
-        wide = _wide_if_better(grid_image, chosen, observations)
-        # An uneven board departs from both maps.
-        chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
-    good &= chosen.weight[: len(good)] > 0
-    noises = PixelNoise(noise, noise, noise)
-    return GridFit(grid_image, lines, fit, chosen, shifts, shading, noises, good)
 
 
 def _may_be_wide(found: MapFit, vertices: Array) -> bool:

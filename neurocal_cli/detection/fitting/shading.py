@@ -11,12 +11,11 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.fitting.strips import Single
-from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.grid import Grid, weights_within
 from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_median
 
-_x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
-# Bilinear weights (64, 4) of a square's corners for samples of its interior, away from the blurred edges.
-_INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
+# Samples of a square's interior, away from the blurred edges.
+_INTERIOR = weights_within(np.stack(np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2), axis=-1).reshape(-1, 2))
 LEVEL_VARIANCE = 0.5 * np.pi / len(_INTERIOR)  # of a square's median, over that of a pixel
 # Insensitive.
 _STEPS = 2  # reweighted fits after the highest degree has been reached
@@ -25,6 +24,7 @@ _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN, to avoid division by 0
 _NEAREST = 3  # the distance of the n-th nearest level is the width of the weights
+_POWERS = [(n - k, k) for n in range(6) for k in range(n + 1)]  # of x and y, by growing degree
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 # Coefficients of richer polynomials, of degree 3 to 5; the ratio of their scatter to that of the best simpler
 # one from which they are used; and the spread of the levels around that, relative to their variances, from
@@ -285,22 +285,12 @@ def excess_variance(residual: Array, variance: Array) -> float:
 def polynomial_terms(frame: Frame, place: Array, count: int) -> Array:
     """1, x, y, x^2, x y, y^2, x^3, ... of places (N, 2) [px], scaled by the frame; (N, count)."""
     x, y = ((place - frame.centre) / frame.unit).T
-    terms = power = [np.ones_like(x)]
-    while len(terms) < count:
-        power = [*(x * term for term in power), y * power[-1]]
-        terms = terms + power
-    return np.stack(terms[:count], axis=-1)
+    return np.stack([x**a * y**b for a, b in _POWERS[:count]], axis=-1)
 
 
 def _polynomial_slopes(frame: Frame, place: Array, count: int) -> tuple[Array, Array]:
     """Derivatives of `polynomial_terms` by u and by v [1/px]."""
     x, y = ((place - frame.centre) / frame.unit).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    power, by_x, by_y = [one], [zero], [zero]
-    du, dv = [zero], [zero]
-    while len(du) < count:
-        by_x = [*(t + x * d for t, d in zip(power, by_x, strict=True)), y * by_x[-1]]
-        by_y = [*(x * d for d in by_y), power[-1] + y * by_y[-1]]
-        power = [*(x * t for t in power), y * power[-1]]
-        du, dv = du + by_x, dv + by_y
-    return np.stack(du[:count], axis=-1) / frame.unit, np.stack(dv[:count], axis=-1) / frame.unit
+    du = np.stack([a * x ** max(a - 1, 0) * y**b for a, b in _POWERS[:count]], axis=-1)
+    dv = np.stack([b * x**a * y ** max(b - 1, 0) for a, b in _POWERS[:count]], axis=-1)
+    return du / frame.unit, dv / frame.unit
