@@ -13,7 +13,7 @@ from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_v
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.observability import is_weak, refuse_undetermined
 from neurocal_cli.adjustment.open_choices import radius
-from neurocal_cli.adjustment.outlier_views import free_networks, least_of_free_networks
+from neurocal_cli.adjustment.outlier_views import least_of_free_networks
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
@@ -46,10 +46,6 @@ _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 # Nested models, from simple to rich.
 _CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
 _SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
-# The same for the quadratic models of the free networks. Where these give less, full descents of the networks
-# never gave more than 1.2; test_free_networks.py repeats it.
-_FAR_FROM_SHORT = 1.15
-_MOST_VIEWS = 60  # views that are compared with free networks, to limit the time
 _BEHIND = 1.5  # times the squared error of a richer model, from which on a model is fitted again
 _LEAST_PENALTY = 7.9  # chi-squared of a superfluous coefficient, exceeded in one case of 200
 # Share of the gain required by the criterion that the rational model must predict; with less, it was never
@@ -240,7 +236,7 @@ class _Chain:
             and (self.wanted == c.problem.distortion.model if self.wanted else not _too_rich(c, fitted))
             for c in fitted
         ]
-        if not any(near) or falls_short(self.problem.views, fitted):
+        if not any(near) or falls_short(fitted):
             return fitted
         return [self._made_monotonic(c) if bad else c for c, bad in zip(fitted, near, strict=True)]
 
@@ -301,20 +297,10 @@ def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:
     )
 
 
-def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
-    """Whether separate free networks fit the views far better than the best common camera.
-
-    Of many views, an evenly spaced subset is used.
-    """
-    best = min(fitted, key=lambda c: c.cost)
-    n = views.n_views
-    some = np.linspace(0, n - 1, min(n, _MOST_VIEWS)).round().astype(np.intp)
-    state, normal = best.adjusted.state, best.adjusted.normal[some]
-    cost = float(normal[:, -1, -1].sum())
-    if cost <= _FAR_FROM_SHORT**2 * float(least_of_free_networks(normal).sum()):
-        return False
-    free = free_networks(views.subset(some), state.of_views(some), _STEPS)
-    return cost > _SHORT**2 * float(free.sum()) + 1e-20
+def falls_short(fitted: Iterable[Candidate]) -> bool:
+    """Whether separate free networks fit the views far better than the best common camera."""
+    normal = min(fitted, key=lambda c: c.cost).adjusted.normal
+    return float(normal[:, -1, -1].sum()) > _SHORT**2 * float(least_of_free_networks(normal).sum()) + 1e-20
 
 
 def worth(views: Views, fitted: Collection[Candidate]) -> float:

@@ -144,7 +144,7 @@ def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
     It is infinite if free networks fit far better or no model is sound. If a focal length is poorly
     determined, another start must be better.
     """
-    if not any(c.sound for c in fitted.values()) or falls_short(views, fitted.values()):
+    if not any(c.sound for c in fitted.values()) or falls_short(fitted.values()):
         return np.inf
     closest = min(fitted.values(), key=lambda c: c.cost)
     return LOWER * closest.cost if closest.weak else 0.0
