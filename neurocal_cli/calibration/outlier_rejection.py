@@ -22,7 +22,6 @@ left out only if the error falls to less than half without them, which trimming 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from math import comb, lgamma, log, pi
 
@@ -257,22 +256,8 @@ def _refuse_few(points: Correspondences, kept: _Kept, failure: DegenerateGeometr
 def _without_outlier_views(
     problem: Problem, options: Options, kept: _Kept, solution: Solution
 ) -> tuple[_Kept, Solution]:
-    """Leave out views of another camera, or of another target than their points say, one by one.
-
-    A distortion model that is selected with the outlier views included can absorb and so hide them.
-    Therefore a pinhole looks for them first, unless the lens is wide.
-    """
+    """Leave out views of another camera, or of another target than their points say, one by one."""
     points = problem.points
-    if options.distortion == "auto" and not solution.state.distortion.wide:
-        pinhole, fewer = replace(options, distortion=""), kept
-        # Under very strong distortion no pinhole can be fitted; this step ends then.
-        with suppress(DegenerateGeometryError):
-            seen = _fitted(problem, fewer.mask, pinhole)
-            while (outlier := _outlier_view(points, fewer, seen)) is not None:
-                fewer = fewer.without(points, outlier)
-                seen = _fitted(problem, fewer.mask, pinhole)
-        if fewer is not kept:
-            kept, solution = fewer, _fitted(problem, fewer.mask, options)
     while (outlier := _outlier_view(points, kept, solution)) is not None:
         kept = kept.without(points, outlier)
         solution = _fitted(problem, kept.mask, options)
