@@ -181,32 +181,24 @@ class PosesFirst:
         self.of_poses = sum(part.logdet for part in self.parts)
         M = self._by_coordinates(self._by_coordinates(sum_of([part.matrix for part in self.parts])).T)
         self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
-        self.sum = np.empty(self.matrix.shape)  # large arrays are quicker to fill again than to allocate
 
     def _by_coordinates(self, rows: Array) -> Array:
         """Rows by cameras, coordinates and right side, instead of by cameras, offsets and right side."""
         f = self.f
         return np.concatenate([rows[:f], self.coordinates.of_rows(rows[f:-1]), rows[-1:]])
 
-    def _with_prior(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
-        """The matrix with the precisions of the prior, and the variances of the coordinates."""
-        variances = self.coordinates.variances(ratios)
-        M, at = self.sum, np.arange(self.f, len(self.matrix))
-        M[...] = self.matrix
-        M[at, at] += 1.0 / variances
-        return M, variances
-
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
-        f, coordinates, (M, variances) = self.f, self.coordinates, self._with_prior(ratios)
-        root, logdet = _root_of_inverse(M)
+        f, coordinates = self.f, self.coordinates
+        variances = coordinates.variances(ratios)
+        root, logdet = _root_of_inverse(self.matrix + np.diag(np.append(np.zeros(f), 1.0 / variances)))
         half, camera, own = root @ self.right, root[:, :f], root[:, f:]
         x = half @ root
 
         def parts() -> Parts:
             prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
-            variances = np.einsum("ij,ij->j", own, own)
-            return Parts.of(prior, x[f:], variances, lambda factors: _squared(own @ factors))
+            found = np.einsum("ij,ij->j", own, own)
+            return Parts.of(prior, x[f:], found, lambda factors: _squared(own @ factors))
 
         return Solved(
             x[:f], lambda: coordinates.offsets(x[f:]), self.given_cost - float(half @ half),
@@ -293,8 +285,15 @@ class PointsFirst:
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
         f, s, n, P, p = self.f, self.s, self.n, self.P, self.p
-        M, own_root, rows, logdet = self._without_points(ratios)
+        of_smooth, of_single = self.prior.variances(ratios)
+        own_root = np.linalg.inv(np.linalg.cholesky(self.info.point + np.eye(3) / of_single[:, :, None]))
+        rows = own_root @ self.by_point
+        flat = rows.reshape(3 * n, -1)
+        M, at = self.bordered - flat.T @ flat, np.arange(f, s)
+        M[at, at] += 1.0 / of_smooth
         root, of_rest = _root_of_inverse(M[:-1, :-1])
+        of_points = -2 * np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum()
+        logdet = float(of_rest + of_points + np.log(of_smooth).sum() + np.log(of_single).sum())
         half = root @ M[:-1, -1]
         x, back = half @ root, np.swapaxes(own_root, 1, 2)
         # Back-substitution of the points: their response to all other unknowns.
@@ -321,25 +320,9 @@ class PointsFirst:
             return Parts.of(prior, np.concatenate([x[f:s], e.ravel()]), variances, covariance)
 
         return Solved(
-            x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
+            x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet,
             cache(parts), camera.T @ camera, joint,
         )  # fmt: skip
-
-    def _without_points(self, ratios: Mapping[str, float]) -> tuple[Array, Array, Array, float]:
-        """The bordered matrix of all other unknowns; roots and rows of the points.
-
-        The log determinant is that of the points' matrices over that of all precisions of the prior.
-        """
-        of_smooth, of_single = self.prior.variances(ratios)
-        own = self.info.point + np.eye(3) / of_single[:, :, None]
-        root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
-        rows = root @ self.by_point
-        flat = rows.reshape(3 * self.n, -1)
-        M = self.bordered - flat.T @ flat
-        at = np.arange(self.f, self.s)
-        M[at, at] += 1.0 / of_smooth
-        logdet = -2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum()
-        return M, root, rows, float(logdet + np.log(of_smooth).sum() + np.log(of_single).sum())
 
 
 def _squared(rows: Array) -> Array:
