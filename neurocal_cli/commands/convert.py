@@ -127,8 +127,8 @@ def convert(
       lensfun   database of one lens, XML
 
     Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI, Argoverse, nuScenes, ZOD, Middlebury,
-    MVSNet, OpenMVG, Meshroom, OpenSfM, OpenDroneMap, BoofCV, multical, calib.io, EasyMocap, mmpose, OpenPTV,
-    ZED, OAK, Azure Kinect, RealSense, freemocap, instant-ngp, Nerfies, Polycam, PhotonVision, Waymo,
+    MVSNet, OpenMVG, Meshroom, OpenSfM, OpenDroneMap, BoofCV, multical, MC-Calib, calib.io, EasyMocap, mmpose,
+    OpenPTV, ZED, OAK, Azure Kinect, RealSense, freemocap, instant-ngp, Nerfies, Polycam, PhotonVision, Waymo,
     Bouguet's toolbox, numbers that OpenCV and NumPy print, and as the nearest fisheye OCamCalib and the FOV
     model.
 

@@ -539,6 +539,12 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         D5,
         None,
     ),
+    "Gear 360 Stitcher": (
+        {"resolution": [640, 480], "params_ds": {**FXY, "alpha": 0.56, "Xi": 0.1}},
+        E,
+        ["double_sphere", 0.1, 0.56],
+        S,
+    ),
     "DROID-SLAM": (f"800.5 801.25 321.3 238.7 {' '.join(map(str, D5))}\n", E, D5, None),
     "Azure Kinect": (
         KINECT,

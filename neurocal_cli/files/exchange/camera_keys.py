@@ -10,8 +10,6 @@ count.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import field
 from functools import cached_property
 from itertools import accumulate, chain
 from typing import Any
@@ -70,7 +68,6 @@ class CameraKeys:
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
     from_middle: bool = False  # whether the principal point is counted from the middle of the image
     by_longer_side: bool = False  # whether all are divided by the longer side of the image
-    constants: Mapping[str, Any] = field(default_factory=dict)  # written as they are
     optional: str = ""  # which coefficients a file may lack: all at once, or any
     aside: str = ""  # other numbers beside those of the camera
     complete: bool = False  # whether there are no others
@@ -200,7 +197,7 @@ class CameraKeys:
         If `every`, because a coefficient is missing, each number may be it.
         """
         numbered = *listed(self.intrinsics), *lens.intrinsics, *lens.places
-        others = *listed(self.size), *self.constants, *split(self.model), self.name, self.skew, self.aspect
+        others = *listed(self.size), *split(self.model), self.name, self.skew, self.aspect
         paths = [path.partition(":")[0] for path in (*numbered, *others) if path]
         different = [one for one in self.table if one.ours not in (lens.ours, "none")]
         words = {plain(word) for one in different for word in one.words if len(word) > 2}
@@ -237,8 +234,6 @@ class CameraKeys:
         width, height = (camera.image_size or (0, 0)) if self.from_middle else (0, 0)
         u0, v0 = u0 - 0.5 * width + self.first_pixel, v0 - 0.5 * height + self.first_pixel
         tree: dict[str, Any] = {}
-        for path, value in self.constants.items():
-            put(tree, path, value)
         if self.model:
             word = lens.words[0]
             put(tree, self.model, word.split("-") if "," in self.model else _BOOLEANS.get(word, word))

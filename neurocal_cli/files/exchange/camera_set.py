@@ -5,7 +5,7 @@ SciPy gets copies of rotations, because older versions refuse read-only arrays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import field, replace
 
 import numpy as np
@@ -92,27 +92,6 @@ class CameraSet:
             poses={name: Pose(pose.R, scale * pose.t) for name, pose in self.poses.items()},
             unit="m",
         )
-
-
-def mounted(
-    cameras: Sequence[Camera],
-    poses: Sequence[Pose | None],
-    program: str,
-    unit: str | None = "m",
-    frame: str = "body",
-) -> CameraSet:
-    """Cameras with their poses, from one frame to each; that of a single camera is its view named `frame`."""
-    if not cameras:
-        raise InputError("holds no camera; give another file")
-    first = poses[0]
-    if len(cameras) == 1:
-        views = {} if first is None else {frame: first}
-        return CameraSet(tuple(cameras), (), views, unit, program=program)
-    known = [pose for pose in poses if pose is not None]
-    relative: tuple[Pose, ...] = ()
-    if len(known) == len(cameras):
-        relative = tuple(after(pose, inverse(known[0])) for pose in known[1:])
-    return CameraSet(tuple(cameras), relative, unit=unit, program=program)
 
 
 def to_vector(R: Array) -> Array:

@@ -36,10 +36,10 @@ from neurocal_cli.files.exchange.camera_keys import CameraKeys
 from neurocal_cli.files.exchange.camera_set import (
     STILL,
     CameraSet,
+    after,
     from_quaternion,
     from_vector,
     inverse,
-    mounted,
     to_quaternion,
     to_vector,
 )
@@ -205,19 +205,27 @@ class Format(CameraKeys):
         return cameras if self.finish is None else self.finish(cameras, found, document)
 
     def _mounted(self, found: Parts) -> CameraSet:
-        """The cameras with the poses between them."""
-        cameras = [self.camera(part, name) for name, part in found.items()]
-        poses: Sequence[Pose | None] = [None] * len(cameras)
-        if not isinstance(self.pose, PoseKeys):
-            poses = poses if self.pose is None else self.pose(found)
-        elif not self.pose.from_first:
-            poses = [self.pose.read(part) for part in found.values()]
-        elif len(cameras) > 1:
-            poses = [STILL, *map(self.pose.read, list(found.values())[1:])]
-        alone = len(cameras) == 1 and getattr(self.pose, "from_first", self.pose is None)
+        """The cameras with the poses between them; that of a single camera is its view."""
+        if not found:
+            raise InputError("holds no camera; give another file")
+        cameras = tuple(self.camera(part, name) for name, part in found.items())
+        first, *others = found.values()
+        poses: Sequence[Pose | None] = []
+        if callable(self.pose):
+            poses = self.pose(found)
+        elif self.pose is not None and (others or not self.pose.from_first):
+            start = STILL if self.pose.from_first else self.pose.read(first)
+            poses = [start, *map(self.pose.read, others)]
+        known = [pose for pose in poses if pose is not None]
+        relative: tuple[Pose, ...] = ()
+        views: dict[str, Pose] = {}
+        if not others:
+            views = {getattr(self.pose, "frame", "body"): pose for pose in known}
+        elif len(known) == len(cameras):
+            relative = tuple(after(pose, inverse(known[0])) for pose in known[1:])
         unit = "m" if self.metres else self.unit
-        unit = unit(next(iter(found.values()))) if callable(unit) else None if alone else unit
-        return mounted(cameras, poses, self.program, unit, getattr(self.pose, "frame", "body"))
+        unit = unit(first) if callable(unit) else unit if poses else None
+        return CameraSet(cameras, relative, views, unit, program=self.program)
 
     def _of_project(self, found: Parts) -> CameraSet:
         """The camera of a project, or that which all are alike, with its poses."""

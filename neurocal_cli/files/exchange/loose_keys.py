@@ -279,6 +279,8 @@ class LooseKeys:
         xi = self.find("xi", side, is_numbers)
         k, named = self._coefficients(side)
         model = self._stated_model(side)
+        if model is None and k is None and xi is not None and self.find("alpha", side, is_numbers):
+            model = "double_sphere"
         if model in ("double_sphere", "eucm") and k is None:
             found = [self.find(name, side, is_numbers) for name in MODELS[model]]
             if any(found) and not all(found):

@@ -128,7 +128,7 @@ def _whole(trees: list[Tree], cameras: CameraSet) -> Tree:
 
 
 # Bouguet's toolbox: Calib_Results.mat and .m, and those of its stereo rigs.
-_SCRIPT = re.compile(r"^\s*fc(_left)?\s*=\s*\[", re.MULTILINE).search
+_SCRIPT = re.compile(r"^[ \t]*fc(_left)?\s*=\s*\[", re.MULTILINE).search
 _VIEW = re.compile(r"(?:omc|Tc)_(\d+)").fullmatch
 _RIGHT = PoseKeys("om T", from_first=True)
 

@@ -115,7 +115,6 @@ EUROC = Format(
     """,
     model="distortion_model",
     size="resolution",
-    constants={"sensor_type": "camera", "camera_model": "pinhole"},
     told=lambda document: (
         document.tree.get("sensor_type") == "camera" or {"T_BS", "intrinsics"} <= set(document.tree)
     ),
@@ -125,6 +124,7 @@ EUROC = Format(
     at_most=1,
     metres=True,
     write=yaml_text,
+    whole=lambda trees, cameras: {"sensor_type": "camera", "camera_model": "pinhole", **trees[0]},
     needs_size=True,
     rig="two files, `T_BS` from each camera to the body (read)",
 )

@@ -55,23 +55,26 @@ _ALL = [one for module in _MODULES for one in vars(module).values() if isinstanc
 READ = [one for one in _ALL if one.told]
 FORMATS = {one.to: one for one in _ALL if one.is_written}  # by the values of the option ``--to``
 
-# What is known and cannot be read: how it begins, or how to tell it; what it is, and what to do.
-_REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
+# What is known and cannot be read: its first bytes, what its text begins with, the keys at its top, or what
+# tells it; and what it is, and what to do.
+_Sign = bytes | str | set[str] | Callable[[Document], object]
+_PICKLE = re.compile(rb"\x80[\2-\5]|\(?[dl]p?\d|c(?:numpy|copy_reg|collections)").match
+_TABLE = re.compile(r"lens_?distortion_?lookup_?table", re.IGNORECASE).search
+_NO_CENTRES = ", whose image sizes and principal points are not in it; give COLMAP's model"
+_BY_POSE2SIM = "Pose2Sim converts it to a TOML that is read here"
+_REFUSED: tuple[tuple[_Sign, str], ...] = (
     (lambda d: not (d.is_folder or d.data.strip() or d.source == "<stdin>"), "is empty; give a camera file"),
     (
         lambda d: "!!python/object" in d.text[:100_000],
         "holds objects of Python, which can run code and are not read; save arrays as lists, array.tolist()",
     ),
     (
-        lambda d: {"projection", "f", "u0"} <= set(d.tree),
+        {"projection", "f", "u0"},
         "is the file of an undistorted panorama; give the camera of the original images",
     ),
     (b"\x89HDF", "is an HDF5 file, as MATLAB writes in its version 7.3; in MATLAB save it with -v7"),
     (
-        lambda d: (
-            re.match(rb"\x80[\2-\5]|\(?[dl]p?\d|c(?:numpy|copy_reg|collections)", d.data)
-            and d.data.rstrip().endswith(b".")
-        ),
+        lambda d: _PICKLE(d.data) and d.data.rstrip().endswith(b"."),
         "is a pickle of Python, which can run code and is not read; in Python load it, and save its numbers "
         "by numpy.savez('camera.npz', K=matrix, D=coefficients)",
     ),
@@ -82,7 +85,7 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
     ),
     KALIBR_REPORT,
     (
-        r"[^\n]*\n?.*<lensdatabase\b",
+        r".*<lensdatabase\b",
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
     ),
     (
@@ -90,7 +93,7 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "is the distortion of a camera of OpenPTV, in mm of the sensor; give its .ori, beside this file",
     ),
     (
-        lambda d: re.search(r"^ParGroup:", d.text[:2000], re.MULTILINE),
+        r"(?:.*\n)?ParGroup:",
         "is a camera of HALCON in metres of the sensor; export its camera matrix in px, or calibrate its "
         "images",
     ),
@@ -99,30 +102,23 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "is a camera of Pix4D in mm of the sensor or from its middle; give calibrated_camera_parameters.txt "
         "of the same project",
     ),
-    (
-        r"#\s*Bundle file",
-        "is a model of Bundler, whose image sizes and principal points are not in it; give COLMAP's model",
-    ),
-    (
-        r"NVM_V3",
-        "is a model of VisualSFM, whose image sizes and principal points are not in it; give COLMAP's model",
-    ),
+    (r"#\s*Bundle file", f"is a model of Bundler{_NO_CENTRES}"),
+    (r"NVM_V3", f"is a model of VisualSFM{_NO_CENTRES}"),
     (
         r".*<KeyFrame [^>]*VICON_RADIAL",
-        "is a calibration of Vicon, whose distortion undistorts, in px; Pose2Sim converts it to a TOML that "
-        "is read here",
+        f"is a calibration of Vicon, whose distortion undistorts, in px; {_BY_POSE2SIM}",
     ),
     (
         r".*<calibration\b[^>]*\bqtm-version=",
         "is a calibration of Qualisys, in 1/64 of a pixel, and the unit of its distortion is not documented; "
-        "Pose2Sim converts it to a TOML that is read here",
+        f"{_BY_POSE2SIM}",
     ),
     (
         lambda d: "<Profile" in d.text[:2000] and "KC1=" in d.text[:100_000],
         "is a calibration of OptiTrack's Motive, whose distortion is not documented; calibrate the images",
     ),
     (
-        lambda d: '"tangential_distortion"' in d.text and '"center"' in d.text and '"res_w"' in d.text,
+        lambda d: all(f'"{key}"' in d.text for key in ("tangential_distortion", "center", "res_w")),
         "holds cameras of Human3.6M (VideoPose3D), whose programs differ in the order and the factor of the "
         "tangential terms; write fx, fy, cx, cy and k1, k2, p1, p2, k3 of OpenCV",
     ),
@@ -137,21 +133,21 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "mm3d Drunk, or calibrate them",
     ),
     (
-        lambda d: {"relativeFocalLength", "viewTransform"} <= set(d.tree),
+        {"relativeFocalLength", "viewTransform"},
         "is a camera of fSpy, relative to the image and from vanishing points; calibrate its images",
     ),
     (
-        lambda d: "CameraCalibrations" in d.tree,
+        {"CameraCalibrations"},
         "is a calibration of Project Aria, whose lens FisheyeRadTanThinPrism is not known here; rectify its "
         "images to a linear camera with Aria's tools, and give that camera",
     ),
     (
-        lambda d: re.search(r"lens_?distortion_?lookup_?table", d.text[:1_000_000], re.IGNORECASE),
+        lambda d: _TABLE(d.text[:1_000_000]),
         "is a calibration of Apple's AVFoundation, whose distortion is a table; rectify the images by it, "
         "and give the camera matrix alone",
     ),
     (
-        lambda d: "cameraParameterTables" in d.tree,
+        {"cameraParameterTables"},
         "is a lens of Unreal, relative to the image and in tables of zoom and focus; calibrate its images",
     ),
     (
@@ -163,7 +159,7 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
         "is a configuration of AprilCal; write fc, cc, kc and lc as fx, fy, cx, cy, k1, k2, p1, p2, k3",
     ),
     (
-        lambda d: "capturingreality.com" in d.text[:2000],
+        r".*capturingreality\.com",
         "is a camera of RealityCapture, relative to the size of the image; export the cameras as COLMAP's "
         "model",
     ),
@@ -174,20 +170,20 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
 )
 
 
-# Keys that tell no format.
-_COMMON = {
-    "fx", "fy", "cx", "cy", "K", "D", "S", "model", "size", "width", "height", "w", "h", "image_width",
-    "image_height",
-}  # fmt: skip
-
-
-def _is(document: Document, sign: bytes | str | Callable[[Document], object]) -> object:
+def _is(document: Document, sign: _Sign) -> object:
     """Whether a document has the sign of a kind of files."""
     if isinstance(sign, bytes):
         return document.data.startswith(sign)
     if isinstance(sign, str):
         return re.match(rf"\s*{sign}", document.text[:2000], re.DOTALL)
-    return sign(document)
+    return sign <= document.tree.keys() if isinstance(sign, set) else sign(document)
+
+
+# Keys that tell no format.
+_COMMON = {
+    "fx", "fy", "cx", "cy", "K", "D", "S", "model", "size", "width", "height", "w", "h", "image_width",
+    "image_height",
+}  # fmt: skip
 
 
 def read_points_or_cameras(
