@@ -438,6 +438,12 @@ def test_matlab_gets_pixels_from_1_and_transposed_matrices(tmp_path: Path) -> No
     assert written(CameraSet((given,)), "matlab", tmp_path)[0].read_bytes() == place.read_bytes()
 
 
+def test_a_model_without_a_camera_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("# no line\n")
+    with pytest.raises(FormatError, match="holds no camera; give another file"):
+        read_cameras([tmp_path])
+
+
 def test_the_toolbox_of_bouguet_is_read(tmp_path: Path) -> None:
     from scipy.io import savemat
 

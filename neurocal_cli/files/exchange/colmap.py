@@ -90,9 +90,9 @@ def _parts(document: Document) -> dict[str, Field]:
             source,
         )
     cameras = _cameras(read, source)
-    _add_rig(document.source, cameras)
-    first = next(iter(cameras))
-    cameras[first].value["views"] = _views_of(document.source, first)
+    for first in list(cameras)[:1]:
+        _add_rig(document.source, cameras, first)
+        cameras[first].value["views"] = _views_of(document.source, first)
     return {f"camera{one}": tree for one, tree in cameras.items()}
 
 
@@ -191,7 +191,7 @@ def _camera(words: list[str], source: str, line: int) -> Field:
     return Field({**tree, "params": list(map(float, values))}, source)
 
 
-def _add_rig(folder: str, cameras: dict[int, Field]) -> None:
+def _add_rig(folder: str, cameras: dict[int, Field], first: int) -> None:
     """Add the poses of the further cameras relative to the first one."""
     rows, source = _file(folder, "rigs")
     if len(cameras) == 1 or rows is None:
@@ -207,7 +207,6 @@ def _add_rig(folder: str, cameras: dict[int, Field]) -> None:
                 raise FormatError("a sensor is no camera, or has no pose", source, line)
             poses[int(rest[1])] = _seven_of(rest[3:10])
             rest = rest[10:]
-        first = next(iter(cameras))
         if poses[first]:
             raise FormatError(f"the reference of the rig must be the camera {first}", source, line)
         for one, camera in cameras.items():
