@@ -51,7 +51,7 @@ _COUNTS = {  # of parameters
     _NAMES[number]: 1 + max(map(int, re.findall(r"\d+\b", line.partition(":")[2])))
     for number, line in _LENSES.items()
 }
-_LINE = re.compile(r"(?:[^\S\n]*\n|#[^\n]*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
+_LINE = re.compile(r"(?:[^\S\n]*\n|#[^\n]*\n)*[^\S\n]*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 _POSE = PoseKeys("q t", from_first=True)
 
 
