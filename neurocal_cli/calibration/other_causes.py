@@ -85,7 +85,7 @@ def lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -
     fits = views_for_target(fits)
     held = [
         contest(problem.views, adjusted.state, problem.free_camera, problem.free_poses,
-                problem.points.image_size)
+                problem.points.image_size, named_lens=not problem.distortion.wide)
         for problem, adjusted in fits
     ]  # fmt: skip
     of_lens = [one.evidence for one in held if one and one.causes and one.causes[0].rival.cause == TOO_SIMPLE]

@@ -65,6 +65,49 @@ def test_auto_takes_a_fisheye_for_one_and_says_so() -> None:
     assert one.verdict.word == "good"
 
 
+def decentred(seed: int, field: float, p1: float, p2: float) -> WideScene:
+    """A wide camera whose lens is decentred, which no fisheye model has."""
+    scene = wide_set(seed, "omnidir", field, n_views=10, sigma=0.1, published=True)
+    lens = scene.camera.distortion
+    camera = replace(
+        scene.camera, distortion=replace(lens, coefficients=np.array([*lens.coefficients[:3], p1, p2]))
+    )
+    points, rng = scene.points, np.random.default_rng(1)
+    pixels = points.pixels.copy()
+    for k, name in enumerate(points.view_names):
+        own = points.view_index == k
+        pixels[own] = camera.project(scene.poses[name].to_camera(points.world[own]))[0]
+    return replace(
+        scene, camera=camera, points=replace(points, pixels=pixels + rng.normal(0, 0.1, pixels.shape))
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "size"),
+    slow_but(((3, 0.02), (9, 0.003)), [(seed, size) for seed in range(20) for size in (0.02, 0.003)]),
+)
+def test_a_decentred_wide_lens_is_found(seed: int, size: float) -> None:
+    scene = decentred(seed, (120.0, 150.0, 180.0)[seed % 3], size, -size / 4)
+    one = found(scene, "auto")
+    assert one.distortion_model == "omnidir"
+    assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+    assert (np.abs(coefficient_errors_over_std(scene, one)) < 4).all()
+    true = scene.camera.intrinsics
+    for name in ("u0", "v0"):
+        assert abs(getattr(one.intrinsics, name) - getattr(true, name)) < 4 * one.std[name]
+
+
+@pytest.mark.parametrize("model", slow_but(("fisheye",), ("fisheye", "eucm", "double_sphere")))
+def test_a_model_that_cannot_be_decentred_is_too_simple_for_such_a_lens(model: str) -> None:
+    one = found(decentred(2, 180.0, 0.02, -0.005), model)
+    assert one.verdict is not None
+    assert one.verdict.word == "poor"
+    assert one.verdict.reasons[0].startswith(
+        "the distortion model is too simple: omnidir lowers the error by"
+    )
+    assert not any("rolling shutter" in reason for reason in one.verdict.reasons)
+
+
 def test_given_intrinsics_and_poses_beyond_90_degrees() -> None:
     scene = wide_set(7, "eucm", 205.0, n_views=8, sigma=0.1)
     angles = np.concatenate([

@@ -20,7 +20,7 @@ from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back, normal_part
-from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import (
     NOT_RADIAL,
     POLYNOMIAL_MODELS,
@@ -177,6 +177,9 @@ class _Chain:
             fisheyes = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
             n = worth(self.problem.views, fisheyes)
             fitted["fisheye"] = min(fisheyes, key=lambda candidate: candidate.criterion(n))
+            decentred = self._decentred(fitted["fisheye"])
+            if decentred is not None:
+                fitted["omnidir"] = decentred
         return fitted
 
     def _promises_little(self, rational: Problem, fitted: dict[str, Candidate]) -> bool:
@@ -224,6 +227,22 @@ class _Chain:
             if candidate is not None:
                 found.append(candidate)
                 state = candidate.adjusted.state
+        return found
+
+    def _decentred(self, fisheye: Candidate) -> Candidate | None:
+        """Fit `omnidir`, a wide lens that may be decentred, if the fisheye's residuals say that it is."""
+        problem, views = supported(self.problem, "omnidir"), self.problem.views
+        state = fisheye.adjusted.state
+        if problem is None or not _is_decentred(fisheye):
+            return None
+        similar = similar_states(state, "omnidir", farthest_angle(views, state))
+        fits = [problem.adjust(start, _STEPS) for start in similar]
+        best = min(fits, key=lambda one: float(one.cost.sum()), default=None)
+        if best is None or not best.converged:
+            return None
+        found = _assessed(problem, best, self.by_views, self.reach)
+        if found is not None and found.not_monotonic == "image":  # its image circle may end within the image
+            return replace(found, not_monotonic=None)
         return found
 
     def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
@@ -303,6 +322,22 @@ def falls_short(fitted: Iterable[Candidate]) -> bool:
     return float(normal[:, -1, -1].sum()) > _SHORT**2 * float(least_of_free_networks(normal).sum()) + 1e-20
 
 
+def _is_decentred(fisheye: Candidate) -> bool:
+    """Whether a lens that is decentred is more probable than this one."""
+    from neurocal_cli.calibration.verdict.findings import LEVEL
+    from neurocal_cli.calibration.verdict.linearised import linearised
+    from neurocal_cli.calibration.verdict.rival import estimates
+    from neurocal_cli.calibration.verdict.rivals import DECENTRED
+
+    problem, state, views = fisheye.problem, fisheye.adjusted.state, fisheye.problem.views
+    effects = () if DECENTRED.effect is None else (DECENTRED.effect,)
+    lin = linearised(views, state, problem.free_camera, problem.free_poses, effects, None)
+    try:
+        return bool(estimates(lin, worth(views, [fisheye]), (DECENTRED,), LEVEL))
+    except np.linalg.LinAlgError:
+        return False
+
+
 def worth(views: Views, fitted: Collection[Candidate]) -> float:
     """Effective number of residuals, given the correlation of neighbours.
 
@@ -318,9 +353,11 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
 def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:
     """Whether coefficients are noise: large ones that cancel, or insignificant new ones.
 
-    New ones are those that the next simpler model lacks; they are tested together. A fisheye has none.
+    New ones are those that the next simpler model lacks; they are tested together. A wide lens has none.
     """
     k = state.k
+    if model in WITH_XI:
+        return False
     if (np.abs(_terms(model, reach) * k) > _LARGEST_TERM).any():
         return True
     new = _NEW.get(model, 0)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.prior import STRETCH
+from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
@@ -29,10 +30,11 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
-from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS, SHAPES, TOO_SIMPLE
+from neurocal_cli.calibration.verdict.rivals import DECENTRED, EFFECTS, RIVALS, SHAPES, TOO_SIMPLE
 from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.nearest_camera import similar_states
 from neurocal_cli.camera.state import CameraState
 
 _MOST_CAUSES = 3  # at once
@@ -87,7 +89,8 @@ def contest(
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
-    lin = linearised(views, state, free, free_poses, EFFECTS, image_size, named_lens)
+    effects = EFFECTS if named_lens else tuple(effect for effect in EFFECTS if effect is not DECENTRED.effect)
+    lin = linearised(views, state, free, free_poses, effects, image_size, named_lens)
     if shaped:
         lin = _with_shape(lin)
     try:
@@ -132,7 +135,10 @@ def _held(lin: Linearised, worth: float) -> Contest:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, share)
         far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
-        least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
+        # What a lens leaves that is decentred by much is known only when it is.
+        least = max(
+            least, (1.0 if chosen[0].rival is DECENTRED else _FAR if far else _MINOR) * chosen[0].evidence
+        )
         for one in chosen:
             causes.append(one)
             alone = one is ranking[0]
@@ -242,6 +248,14 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
             adjust(views.subset(some).batches, state.of_views(some), free, True, NEARBY) for some in groups
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
+    if one.rival is DECENTRED:
+        free = np.append(np.isin(np.arange(5), lin.free), np.ones(5, dtype=bool))
+        starts = similar_states(state, "omnidir", farthest_angle(views, state))
+        each = [adjust(views.batches, start, free, True, NEARBY) for start in starts]
+        best = min(each, key=lambda fit: float(fit.cost.sum()), default=None)
+        return (
+            None if best is None else _Fit(float(best.cost.sum()), None, point_residuals(views, best.state))
+        )
     of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
     if (of_given or one.rival.cause == TOO_SIMPLE) and one.explained > _EXPLAINS_MUCH:
         added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
@@ -302,13 +316,21 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
             if place or not told:
                 continue
             told.insert(0, found)
-            found = max(told, key=lambda one: _graded(contest, one, calibration)[0])  # the gravest
+            found = _likelier_than_not(contest, told, calibration)
             names = dict.fromkeys(x.rival.cause for x in told if x.rival.cause != found.rival.cause)
         grade, reason = _graded(contest, found, calibration)
         if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
             # The standard deviations do not include the board and the lens.
             grade = max(grade, int(not found.rival.of_given))
         yield grade, reason + or_else(names), found.rival.advice
+
+
+def _likelier_than_not(contest: Contest, told: list[Estimate], calibration: Calibration) -> Estimate:
+    """The most probable of those that are as grave as at least half of the probability says."""
+    odds = np.exp([one.evidence - told[0].evidence for one in told])
+    grades = np.array([_graded(contest, one, calibration)[0] for one in told])
+    grave = max(grade for grade in grades if odds[grades >= grade].sum() >= 0.5 * odds.sum())
+    return told[int(np.argmax(grades >= grave))]
 
 
 def given_camera(contest: Contest, calibration: Calibration) -> list[Finding]:

@@ -63,6 +63,17 @@ def moving(seen: Seen) -> Array | None:
     return seen.by_entries[:, 3:5] * (seen.pixels[:, 1] * nearer / nearer.mean())[:, None, None]
 
 
+def decentred(seen: Seen) -> Array | None:
+    """The tangential terms p1 and p2, in the image, of a wide lens whose model has none."""
+    if not seen.centred:
+        return None
+    x, y = seen.pixels[:, None, 0], seen.pixels[:, None, 1]
+    r2, by_u, by_v = x**2 + y**2, seen.by_entries[:, 3], seen.by_entries[:, 4]
+    return np.stack(
+        [2 * x * y * by_u + (r2 + 2 * y**2) * by_v, (r2 + 2 * x**2) * by_u + 2 * x * y * by_v], axis=1
+    )
+
+
 def cut(axis: int) -> Effect:
     """The farther half of the images along u or v is displaced."""
     return lambda seen: seen.by_entries[:, 3:5] * (seen.pixels[:, None, None, axis] > 0)

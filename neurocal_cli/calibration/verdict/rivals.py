@@ -24,6 +24,16 @@ _STILL = "keep camera and target still, or use a camera with a global shutter"
 _WHOLE = "give the images as the sensor has them, or calibrate each half as a camera of its own"
 TOO_SIMPLE = "a lens that is too simple"
 """Name of the cause that the lens lacks coefficients."""
+DECENTRED = Rival(
+    TOO_SIMPLE,
+    "residuals of a wide lens that grow towards one side of the image",
+    "give --distortion auto or omnidir",
+    words.too_simple("omnidir"),
+    DISPLACED,
+    effects.common,
+    effect=effects.decentred,
+)
+"""A wide lens whose model has no tangential terms and needs them."""
 
 RIVALS: tuple[Rival, ...] = (
     *(
@@ -38,6 +48,7 @@ RIVALS: tuple[Rival, ...] = (
         )
         for model in POLYNOMIAL_MODELS[1:]
     ),
+    DECENTRED,
     Rival(
         "a wrong given parameter",
         "the given focal length or centre, moved, takes the residuals away",
