@@ -154,7 +154,7 @@ class _Chain:
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         """Fit all models that the points support, each from the best of the simpler ones."""
-        fitted: dict[str, Candidate] = {}
+        first, fitted = state, dict[str, Candidate]()
         least = np.inf  # any fit replaces a pinhole
         if state.model != "none":
             least = float((point_residuals(self.problem.views, state) ** 2).sum())
@@ -177,7 +177,7 @@ class _Chain:
             fisheyes = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
             n = worth(self.problem.views, fisheyes)
             fitted["fisheye"] = min(fisheyes, key=lambda candidate: candidate.criterion(n))
-            decentred = self._decentred(fitted["fisheye"])
+            decentred = self._decentred(fitted["fisheye"], first)
             if decentred is not None:
                 fitted["omnidir"] = decentred
         return fitted
@@ -229,14 +229,19 @@ class _Chain:
                 state = candidate.adjusted.state
         return found
 
-    def _decentred(self, fisheye: Candidate) -> Candidate | None:
-        """Fit `omnidir`, a wide lens that may be decentred, if the fisheye's residuals say that it is."""
+    def _decentred(self, fisheye: Candidate, first: CameraState) -> Candidate | None:
+        """Fit `omnidir`, a wide lens that may be decentred, if the fisheye's residuals say that it is.
+
+        It starts from the first state if that is one.
+        """
         problem, views = supported(self.problem, "omnidir"), self.problem.views
         state = fisheye.adjusted.state
         if problem is None or not _is_decentred(fisheye):
             return None
-        similar = similar_states(state, "omnidir", farthest_angle(views, state))
-        fits = [problem.adjust(start, _STEPS) for start in similar]
+        starts = [first]
+        if first.model != "omnidir":
+            starts = similar_states(state, "omnidir", farthest_angle(views, state))
+        fits = [problem.adjust(start, _STEPS) for start in starts]
         best = min(fits, key=lambda one: float(one.cost.sum()), default=None)
         if best is None or not best.converged:
             return None

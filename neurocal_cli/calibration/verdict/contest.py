@@ -34,7 +34,6 @@ from neurocal_cli.calibration.verdict.rivals import DECENTRED, EFFECTS, RIVALS, 
 from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.nearest_camera import similar_states
 from neurocal_cli.camera.state import CameraState
 
 _MOST_CAUSES = 3  # at once
@@ -249,6 +248,8 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
     if one.rival is DECENTRED:
+        from neurocal_cli.camera.nearest_camera import similar_states
+
         free = np.append(np.isin(np.arange(5), lin.free), np.ones(5, dtype=bool))
         starts = similar_states(state, "omnidir", farthest_angle(views, state))
         each = [adjust(views.batches, start, free, True, NEARBY) for start in starts]
