@@ -39,6 +39,19 @@ def lines(head: str, prefix: str, **values: object) -> str:
     return head + "".join(f"{prefix}{key}: {value}\n" for key, value in values.items())
 
 
+def visp(*models: str) -> str:
+    """A file of ViSP with models of one camera."""
+    focal = "<px>800.5</px><py>801.25</py><u0>321.3</u0><v0>238.7</v0>"
+    parts = "".join(
+        f"<model><type>{model.partition(' ')[0]}</type>{focal}{model.partition(' ')[2]}</model>"
+        for model in models
+    )
+    size = "<image_width>640</image_width><image_height>480</image_height>"
+    return f"""<?xml version="1.0"?>
+<root><!--vpCameraParameters--><camera><name>Camera</name>{size}{parts}
+<additional_information><date>2020/05/13</date></additional_information></camera></root>"""
+
+
 def metashape(kind: str, more: str) -> str:
     elements = f"<f>801.25</f><cx>1.8</cx><cy>-0.8</cy><b1>-0.75</b1>{more}"
     return (
@@ -322,6 +335,24 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         metashape("frame", "<k1>-0.31</k1><k2>0.12</k2><k3>0.02</k3><p1>-0.0007</p1><p2>0.0011</p2>"),
         E,
         D5,
+        S,
+    ),
+    "ViSP": (
+        visp(
+            "perspectiveProjWithoutDistortion",
+            "perspectiveProjWithDistortion <kud>-0.31</kud><kdu>0.33</kdu>",
+        ),
+        E,
+        [-0.31, 0, 0, 0, 0],
+        S,
+    ),
+    "ViSP without distortion": (visp("perspectiveProjWithoutDistortion"), E, [0, 0, 0, 0, 0], S),
+    "ViSP's fisheye": (
+        visp(
+            "ProjWithKannalaBrandtDistortion " + "".join(f"<k{k}>{c}</k{k}>" for k, c in enumerate(FOUR, 1))
+        ),
+        E,
+        FISH,
         S,
     ),
     "Metashape's fisheye": (

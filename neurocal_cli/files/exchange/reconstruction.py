@@ -1,4 +1,4 @@
-"""Formats of reconstruction from photographs: Metashape, OpenMVG, AliceVision, OpenSfM, OpenDroneMap, Pix4D.
+"""Formats of reconstruction and visual servoing: Metashape, OpenMVG, AliceVision, OpenSfM, Pix4D, ViSP.
 
 Their files hold the cameras of a whole project; one camera is read, or the one that all are alike.
 """
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_tree import xml_root
+from neurocal_cli.files.camera_tree import plain_value, xml_root
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import in_rows
@@ -89,6 +89,39 @@ METASHAPE = Format(
     project=True,
     write=_agisoft,
     needs_size=True,
+)
+
+
+# ViSP's cameras, each with several models of one calibration: the last one has the distortion.
+def _visp_parts(document: Document) -> dict[str, Tree]:
+    parts = {}
+    for k, camera in enumerate(xml_root(document.text, document.source).iter("camera")):
+        own = {child.tag: plain_value(child.text or "") for child in camera if not len(child)}
+        models = camera.findall("model")
+        if len(models) > 1:
+            document.notes.append(
+                f"{document.source}: holds the camera without distortion as well, which is passed over"
+            )
+        for model in models[-1:]:
+            tree = own | {child.tag: plain_value(child.text or "") for child in model}
+            parts[f"{own.get('name', 'camera')} {k}"] = tree
+    return parts
+
+
+VISP = Format(
+    "ViSP",
+    "px,py,u0,v0",
+    """
+    perspectiveProjWithoutDistortion: none
+    perspectiveProjWithDistortion: k1 kud
+    ProjWithKannalaBrandtDistortion: fisheye *
+    """,
+    model="type",
+    size="image_width,image_height",
+    told=lambda document: re.search(r"<type>\s*(perspectiveP|P)rojWith", document.text[:100_000]),
+    files="cameras of vpXmlParserCamera, XML",
+    parts=_visp_parts,
+    project=True,
 )
 
 
