@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_tree import plain_value, xml_root
+from neurocal_cli.files.camera_tree import xml_root
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import in_rows
 from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.yaml_text import plain_value
 
 
 # Agisoft Metashape: f in pixels, the principal point from the middle of the image, p1 and p2 exchanged. A
