@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,6 +36,9 @@ from neurocal_cli.camera.nearest_camera import similar_states
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.verdict.rival import Estimate, Rival
+
 # Repeated by test_model_selection.py (slow: 200 lenses of each of six models) and
 # test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
 # the tightest that give these results; penalties and significance tests are chi-squared levels, as noted.
@@ -59,6 +63,8 @@ _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearl
 _SPARE = 1.3  # fewest equations per unknown
 _WIDE = 0.7  # least radius of the points for a fisheye model: 35 degrees from the axis
 _TOLD_APART = 4.0  # squared standard deviations per coefficient that differ significantly from 0
+# Chi-squared of p1 and p2 of a wide lens: photographs whose p1 is 2.5 std, counted by views, reach 35.
+_DECENTRED = 40.0
 _LARGEST_TERM = 3.0  # largest term of one coefficient at the farthest point; all terms together are about 1
 
 
@@ -234,9 +240,12 @@ class _Chain:
 
         It starts from the first state if that is one.
         """
+        from neurocal_cli.calibration.verdict.findings import LEVEL
+        from neurocal_cli.calibration.verdict.rivals import DECENTRED
+
         problem, views = supported(self.problem, "omnidir"), self.problem.views
         state = fisheye.adjusted.state
-        if problem is None or not _is_decentred(fisheye):
+        if problem is None or not any(one.evidence > LEVEL for one in _causes(fisheye, (DECENTRED,))):
             return None
         starts = [first]
         if first.model != "omnidir":
@@ -246,9 +255,10 @@ class _Chain:
         if best is None or not best.converged:
             return None
         found = _assessed(problem, best, self.by_views, self.reach)
-        if found is not None and found.not_monotonic == "image":  # its image circle may end within the image
-            return replace(found, not_monotonic=None)
-        return found
+        if found is None or not _is_decentred(found):
+            return None
+        # Its image circle may end within the image.
+        return replace(found, not_monotonic=None) if found.not_monotonic == "image" else found
 
     def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
         """Fit promising models again that are not monotonic in image corners without points."""
@@ -322,25 +332,41 @@ def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:
 
 
 def falls_short(fitted: Iterable[Candidate]) -> bool:
-    """Whether separate free networks fit the views far better than the best common camera."""
-    normal = min(fitted, key=lambda c: c.cost).adjusted.normal
-    return float(normal[:, -1, -1].sum()) > _SHORT**2 * float(least_of_free_networks(normal).sum()) + 1e-20
+    """Whether separate free networks fit the views far better than the best common camera.
+
+    The reason must be another one than the shape of the target.
+    """
+    from neurocal_cli.calibration.verdict.rivals import SHAPES
+
+    best = min(fitted, key=lambda c: c.cost)
+    least = _SHORT**2 * float(least_of_free_networks(best.adjusted.normal).sum()) + 1e-20
+    if best.cost <= least:
+        return False
+    return best.cost * (1.0 - max((one.explained for one in _causes(best, SHAPES)), default=0.0)) > least
 
 
-def _is_decentred(fisheye: Candidate) -> bool:
-    """Whether a lens that is decentred is more probable than this one."""
-    from neurocal_cli.calibration.verdict.findings import LEVEL
+def _is_decentred(omnidir: Candidate) -> bool:
+    """Whether p1 and p2 differ from 0, by as many residuals as are independent."""
+    problem, views, state = omnidir.problem, omnidir.problem.views, omnidir.adjusted.state
+    C = covariance(problem.minimum(omnidir.adjusted), views.n_equations).entries[-2:, -2:]
+    if not np.isfinite(C).all():
+        return False
+    told = state.k[-2:] @ np.linalg.pinv(C, hermitian=True) @ state.k[-2:]
+    return bool(told * worth(views, [omnidir]) > _DECENTRED * views.n_equations)
+
+
+def _causes(candidate: Candidate, rivals: tuple[Rival, ...]) -> list[Estimate]:
+    """The causes of its residuals among these, the most probable first."""
     from neurocal_cli.calibration.verdict.linearised import linearised
     from neurocal_cli.calibration.verdict.rival import estimates
-    from neurocal_cli.calibration.verdict.rivals import DECENTRED
 
-    problem, state, views = fisheye.problem, fisheye.adjusted.state, fisheye.problem.views
-    effects = () if DECENTRED.effect is None else (DECENTRED.effect,)
+    problem, state, views = candidate.problem, candidate.adjusted.state, candidate.problem.views
+    effects = tuple(one.effect for one in rivals if one.effect is not None)
     lin = linearised(views, state, problem.free_camera, problem.free_poses, effects, None)
     try:
-        return bool(estimates(lin, worth(views, [fisheye]), (DECENTRED,), LEVEL))
+        return estimates(lin, lin.spare, rivals)
     except np.linalg.LinAlgError:
-        return False
+        return []
 
 
 def worth(views: Views, fitted: Collection[Candidate]) -> float:

@@ -62,7 +62,7 @@ _CERTAIN = 2.0
 # cameras, of which one is left if points are held out where these are predicted as well.
 _FEW_POSES = 4
 _DECIDEDLY = 1.03
-_WORTH = 1.05  # factor by which coefficients that cancel, or a decentred lens, must lower the rms error
+_WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
 _SIMPLER = -1.0  # and for a simpler one
@@ -93,9 +93,6 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
         by_points = judged_again(fitted, False, repeated)
         if by_points and _least_held_out(by_points) <= _DECIDEDLY**2 * _least_held_out(fitted):
             fitted = by_points
-    lost = [fitted[name].lost for name in ("omnidir", "fisheye") if name in fitted]
-    if len(lost) == 2 and not predicts_decidedly_better(lost[0], lost[1], repeated, _WORTH):
-        del fitted["omnidir"]
     name, good = _best(fitted, views, repeated)
     chosen = fitted[preferred if preferred in good else name]
     n, px = len(views.index), views.pixel_scale
