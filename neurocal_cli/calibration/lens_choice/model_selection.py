@@ -216,11 +216,14 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
     if not ordinary:
         return fitted
     lowest, least = min(c.criterion(n) for c in ordinary), min(c.held_out for c in ordinary)
-    return {
+    kept = {
         name: c
         for name, c in fitted.items()
         if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
+    # Ordinary lenses may be decentred as well.
+    far = min(c.cost for c in ordinary) / FAR_BETTER**2
+    return {name: c for name, c in kept.items() if name != "omnidir" or "fisheye" in kept or c.cost < far}
 
 
 def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
