@@ -192,17 +192,22 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
         return
     worlds = worlds_by_view(points)
     step = _steps(worlds)
-    # The spacing that most views have; of two equally common ones, the first view's.
-    alike = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
-    usual = float(step[np.argmax(alike.sum(axis=1))])
-    off = np.abs(np.log(step / usual)) > np.log(_SCALED)
+    # The spacing that most views have; of equally common ones, that in the middle, the first of two.
+    log = np.log(step)
+    alike = (np.abs(log[:, None] - log[None]) < np.log(_SCALED)).sum(axis=1)
+    common = np.flatnonzero(alike == alike.max())
+    middle = common[np.abs(log[common] - median(log)).round(6).argmin()]
+    ratios = log - log[middle]
+    off = np.abs(ratios) > np.log(_SCALED)
     if not off.any():
         return
     off &= ~_seen_in_others(worlds, off)
-    for ratio in np.unique(np.round(np.log(step[off] / usual), 3)):
-        names = np.array(points.view_names)[off & (np.abs(np.log(step / usual) - ratio) < _ROUND)]
+    # Where the spacing of half of the views varies, so does its ratio to the true unit.
+    varies = float(np.sort(np.abs(ratios))[(len(step) - 1) // 2])
+    for ratio in sorted(np.unique(np.round(ratios[off], 3)), key=lambda one: -abs(one)):
+        names = np.array(points.view_names)[off & (np.abs(ratios - ratio) < _ROUND)]
         factor = float(np.exp(abs(ratio)))
-        unit = units_mixed(factor)
+        unit = units_mixed(factor, _ROUND + varies)
         yield (
             1,
             f"{name_some(names)}: the points lie {float(f'{factor:.3g}'):g} times "
@@ -213,11 +218,11 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
         )
 
 
-def units_mixed(factor: float) -> str:
+def units_mixed(factor: float, within: float = _ROUND) -> str:
     """What is added to this ratio of lengths if it is that of two units; "" if it is not."""
     factor = max(factor, 1 / factor)
     known = min(_UNITS, key=lambda ratio: abs(factor / ratio - 1))
-    return f", as with {_UNITS[known]} mixed" if abs(factor / known - 1) < _ROUND else ""
+    return f", as with {_UNITS[known]} mixed" if abs(factor / known - 1) < within else ""
 
 
 def worlds_by_view(points: Correspondences) -> list[Array]:

@@ -68,6 +68,7 @@ _TOO_MANY = {*WIDE, *WITH_PRISM} - {"fisheye"}
 DISTORTIONS = ("auto", *(model for model in MODELS if model not in _TOO_MANY))
 # Of known cameras; test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach.
 _MEMBERS = 4
+_TOGETHER = 2  # most settings that are left out at once, as those whose names are exchanged
 
 
 def fit_lens(
@@ -156,17 +157,35 @@ def _train_and_reject(
     """Steps 2 and 3, with rejection of settings that contradict all others."""
     while True:
         joints = _trained(start, options)
-        if not options.reject or not start.may_reject:
+        rest = _without_odd(start, joints, options) if options.reject else None
+        if rest is None:
             return start, joints
-        suspect = most_suspect(*left_out_errors(start, joints[0]))
+        start = rest
+
+
+def _without_odd(
+    start: CalibratedSettings, joints: list[Joint], options: FitOptions
+) -> CalibratedSettings | None:
+    """The result without a setting that contradicts all others, or without two; None if there are none.
+
+    Two settings of which each has the other's name hide each other: without one of them, the networks still
+    follow the other one.
+    """
+    rest, odd = start, list[tuple[Array, Tables, int]]()
+    while len(odd) < _TOGETHER and start.may_reject(len(odd)):
+        suspect = most_suspect(*left_out_errors(rest, joints[0]))
         if suspect is None:
-            return start, joints
-        setting, rest = start.lens.settings[suspect], start.without(suspect)
-        trial = _trained(rest, replace(options, budget=replace(options.budget, starts=6)))
-        reason = contradiction(provisional(rest, trial, options), setting, start.tables, suspect)
-        if reason is None:
-            return start, joints
-        start = rest.with_rejected(setting, reason)
+            return None
+        odd.append((rest.lens.settings[suspect], rest.tables, suspect))
+        rest = rest.without(suspect)
+        joints = _trained(rest, replace(options, budget=replace(options.budget, starts=6)))
+        lens = provisional(rest, joints, options)
+        reasons = [contradiction(lens, *one) for one in odd]
+        if all(reasons):
+            for (setting, *_), reason in zip(odd, reasons, strict=True):
+                rest = rest.with_rejected(setting, reason or "")
+            return rest
+    return None
 
 
 def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:

@@ -110,10 +110,9 @@ class CalibratedSettings:
         unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
         return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
 
-    @property
-    def may_reject(self) -> bool:
-        """Whether fewer than a fifth of the settings are rejected; one always may be."""
-        return len(self.rejected) < max(1, self.lens.n_settings // 5)
+    def may_reject(self, besides: int = 0) -> bool:
+        """Whether fewer than a fifth of the settings are rejected, with some more; one always may be."""
+        return len(self.rejected) + besides < max(1, self.lens.n_settings // 5)
 
     def without(self, setting: int, progress: Progress | None = None) -> CalibratedSettings:
         """The result without a setting. Only the common constants are found again."""
@@ -195,7 +194,7 @@ def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> Cal
             )
         rms = np.sqrt(normal.cost / start.data.counts)
         worst, typical = int(rms.argmax()), float(np.median(rms))
-        if not options.reject or rms[worst] <= _WRONG_PIXELS * typical or not start.may_reject:
+        if not options.reject or rms[worst] <= _WRONG_PIXELS * typical or not start.may_reject():
             return start
         reason = f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
         setting = start.lens.settings[worst]
