@@ -6,7 +6,7 @@ bit with and without this module. Otherwise
 1. each view's network is trained again robustly (`consensus`); points far from it are left out, and so are
    views whose points do not agree on any network;
 2. the rest is calibrated, and views that fit a network of their own but not the common camera are left out
-   (`outlier_views`);
+   (`odd_view`);
 3. the camera judges every point, including those left out before. Points whose error exceeds the largest
    expected of so many normal errors are left out, and the rest is calibrated again, until nothing changes.
 
@@ -28,13 +28,12 @@ from math import comb, lgamma, log, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.outlier_views import find_outlier_view
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.other_causes import contradicts_sigma, error_of_view, why_odd
+from neurocal_cli.calibration.other_causes import contradicts_sigma, error_of_view, odd_view, why_odd
 from neurocal_cli.calibration.point_errors import FLOOR, PointErrors, largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import MISFIT, TOLD, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -157,7 +156,7 @@ def _contradicts_noise(solution: Solution, errors: PointErrors) -> bool:
     everything = np.ones(len(points), dtype=bool)
     if (error >= largest_expected(errors, everything, points)[points.view_index]).any():
         return True
-    return find_outlier_view(solution) is not None
+    return odd_view(solution) is not None
 
 
 def _fitted(problem: Problem, mask: NDArray[np.bool_], options: Options) -> Solution:
@@ -267,7 +266,7 @@ def _without_outlier_views(
 def _outlier_view(points: Correspondences, kept: _Kept, solution: Solution) -> str | None:
     """The view that contradicts the others most; None if there is none, or a third is left out already."""
     most = (points.n_views - 1) // 3
-    return find_outlier_view(solution) if len(kept.wrong_views) < most else None
+    return odd_view(solution) if len(kept.wrong_views) < most else None
 
 
 def _all_judged(

@@ -17,8 +17,8 @@ from neurocal_cli.adjustment.covariance import (
     pose_std,
     with_scale,
 )
+from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.adjustment.observability import refuse_undetermined
-from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution

@@ -32,7 +32,7 @@ from neurocal_cli.adjustment.board.find import (
 )
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.common_noise import reweighted
-from neurocal_cli.adjustment.outlier_views import variance_of_views
+from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.campaign import scene as campaign_scene
 from support.outliers import MISMATCHES, farthest, good, mismatched, with_outliers
 from support.scenes import pinhole, random_flat_set, table_1
 from support.slow_cases import slow_but
@@ -64,6 +65,19 @@ def test_a_wrong_view_of_ten_changes_nothing(kind: str) -> None:
 def test_a_wrong_view_of_ten_changes_nothing_in_many_scenes(distortion: str) -> None:
     for seed in range(105):
         a_wrong_view_changes_nothing(seed, MISMATCHES[seed % len(MISMATCHES)], distortion)
+
+
+def test_no_view_is_left_out_unless_a_cause_differs_between_views() -> None:
+    points, _ = campaign_scene(29)  # one of its six clean views has 34 times the contradiction of the others
+    assert not calibrate(points).rejected.views
+
+
+@pytest.mark.slow
+def test_no_view_is_left_out_if_all_lack_the_same_coefficients() -> None:
+    points, _ = campaign_scene(204)
+    named = calibrate(points, distortion="eucm")
+    assert not named.rejected.views
+    assert any("distortion model is too simple" in reason for reason in named.verdict.reasons)
 
 
 @pytest.mark.parametrize("flat", slow_but((True,), [True, False]))

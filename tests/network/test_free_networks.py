@@ -7,7 +7,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate, read_points
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.outlier_views import free_networks, least_of_free_networks
+from neurocal_cli.adjustment.free_networks import free_networks, least_of_free_networks
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.calibration.verdict.assessment import _AtMinimum
 from neurocal_cli.camera.state import CameraState

@@ -11,10 +11,10 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.covariance import counting_views, covariance
 from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_views, reduced
+from neurocal_cli.adjustment.free_networks import least_of_free_networks
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.observability import is_weak, refuse_undetermined
 from neurocal_cli.adjustment.open_choices import radius
-from neurocal_cli.adjustment.outlier_views import least_of_free_networks
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks

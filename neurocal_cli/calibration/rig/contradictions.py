@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import solve_scaled
-from neurocal_cli.adjustment.outlier_views import OUTLIER
 from neurocal_cli.adjustment.reprojection import squared_errors
+from neurocal_cli.calibration.other_causes import OUTLIER
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
 from neurocal_cli.calibration.rig.causes import (
     LATE_CAMERA,

@@ -26,7 +26,7 @@ from neurocal_cli.adjustment.cross_validation import (
     inverse_or_nan,
     reduced,
 )
-from neurocal_cli.adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
+from neurocal_cli.adjustment.free_networks import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels

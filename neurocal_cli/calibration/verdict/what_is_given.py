@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.outlier_views import variance_of_views
+from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import Solution

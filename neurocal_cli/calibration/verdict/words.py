@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
-from neurocal_cli.adjustment.outlier_views import seen_from_behind
+from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
 from neurocal_cli.calibration.verdict.linearised import Linearised
