@@ -43,11 +43,9 @@ from neurocal_cli.adjustment.cross_validation import (
     quietly,
     solve_or_nan,
 )
-from neurocal_cli.adjustment.normal_equations import Arrowhead, inverse_scaled, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import Covariance, unit_diagonal
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import (
-    POSE,
-    POSE_COLUMNS,
     camera_columns,
     normal_blocks,
     pose_response,
@@ -64,15 +62,6 @@ from neurocal_cli.camera.state import CameraState
 _POOR = 0.05  # std of a parameter over its value (for the centre: over alpha)
 _POOR_THETA = 0.02  # rad
 _TOLD_APART = 2.0  # standard deviations from which on a coefficient differs significantly from 0
-
-
-@frozen_dataclass(eq=False)
-class Covariance:
-    """Covariances in normalised units."""
-
-    entries: Array  # (f, f) of A's free entries and the free distortion coefficients
-    poses: Array  # (V, 6, 6) of omega and tau of each view; zero if the poses are given
-    smallest: float  # smallest eigenvalue of the normal matrices scaled to a unit diagonal; 0 if singular
 
 
 @frozen_dataclass(eq=False)
@@ -95,23 +84,10 @@ class CovarianceBasis:
 def covariance(m: Minimum, n_equations: float, shared: Array | None = None) -> Covariance:
     """Invert the normal matrices of a calibration, with the variance of the residuals of so many equations.
 
-    If the covariance `shared` (f, f) of the free entries and coefficients comes from elsewhere, the poses'
-    covariance is propagated from it.
+    If the covariance `shared` (f, f) of the free entries and coefficients comes from elsewhere, the poses
+    follow it.
     """
-    normal, f, V, variance = m.normal, m.columns, len(m.normal), m.variance(n_equations)
-    if not m.free_poses:
-        if shared is not None:
-            return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
-        U = normal[:, f[:, None], f].sum(axis=0)
-        inverse, smallest = inverse_scaled(U, U)
-        return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
-    if shared is None:
-        found = Arrowhead.of(normal, f, POSE_COLUMNS).covariance()
-        return Covariance(variance * found.shared, variance * found.own, found.smallest)
-    B = normal[:, POSE, POSE]
-    B_inverse, smallest = inverse_scaled(B, B)
-    gain = normal[:, f, POSE] @ B_inverse
-    return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)
+    return m.arrow.covariance(m.variance(n_equations), shared)
 
 
 def entry_covariance(
@@ -242,9 +218,9 @@ def counting_views(
     """
     repeated = m.repeated
     assert repeated is not None
-    if not m.free.any() or not np.isfinite(found.entries).all():
+    if not m.free.any() or not np.isfinite(found.shared).all():
         return found
-    variance, whole, entries = m.variance(n_equations), m.quadratics, found.entries
+    variance, whole, entries = m.variance(n_equations), m.quadratics, found.shared
     told = _determined(whole.S.sum(axis=0))
     if told is not None:
         into, back = told
@@ -267,12 +243,8 @@ def counting_views(
     if entries is before or not np.isfinite(entries).all():
         return found
     if told is not None:
-        entries = found.entries + into @ (entries - before) @ into.T
-    poses = found.poses
-    if m.free_poses:
-        gain = pose_response(m.normal, m.columns)
-        poses = poses + gain @ (entries - found.entries) @ np.swapaxes(gain, 1, 2)
-    return replace(found, entries=entries, poses=poses)
+        entries = found.shared + into @ (entries - before) @ into.T
+    return replace(found, shared=entries)
 
 
 def _determined(S: Array) -> tuple[Array, Array] | None:

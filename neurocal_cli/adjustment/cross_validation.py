@@ -24,7 +24,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import eliminate, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import Arrowhead, eliminate, unit_diagonal
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, folds_of
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, free_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views, batches_of
@@ -184,6 +184,11 @@ class Minimum:
     def columns(self) -> NDArray[np.intp]:
         """Columns (f,) of the free parameters in the normal matrices."""
         return free_columns(self.free)
+
+    @cached_property
+    def arrow(self) -> Arrowhead:
+        """Normal equations of the free parameters, and of the poses if these are free."""
+        return Arrowhead.of(self.normal, self.columns, POSE_COLUMNS if self.free_poses else POSE_COLUMNS[:0])
 
     @cached_property
     def quadratics(self) -> Quadratics:

@@ -9,6 +9,8 @@ with the number of blocks.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -152,6 +154,11 @@ class Arrowhead:
         s = len(self.shared)
         return self.shared - self.cross.reshape(-1, s).T @ solved.reshape(-1, s), solved
 
+    @property
+    def follow(self) -> Array:
+        """(V, p, s) how the own unknowns follow the shared ones."""
+        return -solve_scaled(self.own, self.cross[:, :, :-1])
+
     def step(self, damping: float) -> tuple[Array, Array, float]:
         """Damped Gauss-Newton step; `damping` is the share of the diagonal that is added to it (Marquardt).
 
@@ -177,29 +184,53 @@ class Arrowhead:
         gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)
         return step, by_own, float(gain)
 
-    def covariance(self) -> SchurCovariance:
-        """Inverse of the normal matrix, block by block.
+    def covariance(self, variance: float = 1.0, shared: Array | None = None) -> Covariance:
+        """Inverse of the normal matrix times the variance of the residuals: the Cramer-Rao bound.
 
-        Times the residual variance it is the Cramer-Rao bound at the estimate.
+        If the covariance `shared` (s, s) of the shared unknowns comes from elsewhere, the own ones follow it.
         """
-        U, C = self.shared[:-1, :-1], np.swapaxes(self.cross[:, :, :-1], 1, 2)
+        U, C = self.shared[:-1, :-1], self.cross[:, :, :-1]
         B_inverse, smallest = inverse_scaled(self.own, self.own)
-        gain = C @ B_inverse
-        S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
-        S_inverse, smallest_shared = inverse_scaled(S, U)
-        cross = -S_inverse @ gain
-        covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
-        return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))
+        follow = -B_inverse @ C
+        if shared is None:
+            inverse, of_shared = inverse_scaled(U + (np.swapaxes(C, 1, 2) @ follow).sum(axis=0), U)
+            shared, smallest = variance * inverse, min(smallest, of_shared)
+        return Covariance(shared, variance * B_inverse, follow, smallest)
 
 
 @frozen_dataclass(eq=False)
-class SchurCovariance:
-    """Blocks of the inverse of an arrowhead matrix."""
+class Covariance:
+    """Covariance of unknowns that all blocks share, and of each block's own.
 
-    shared: Array  # (f, f)
-    own: Array  # (V, p, p)
-    cross: Array  # (V, f, p) between the shared unknowns and each block's own
+    The own unknowns follow the shared ones, so that all that makes these more uncertain changes `shared`
+    alone.
+    """
+
+    shared: Array  # (s, s)
+    alone: Array  # (V, p, p) of the own unknowns for known shared ones
+    follow: Array  # (V, p, s) how the own unknowns follow the shared ones
     smallest: float  # smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular
+
+    @cached_property
+    def own(self) -> Array:
+        """(V, p, p) covariance of the own unknowns."""
+        return np.asarray(self.alone + self.follow @ self.cross)
+
+    @cached_property
+    def cross(self) -> Array:
+        """(V, s, p) covariance between the shared unknowns and each block's own."""
+        return np.asarray(self.shared @ np.swapaxes(self.follow, 1, 2))
+
+    def extended(self, columns: Columns, added: Array, follow: Array) -> Covariance:
+        """With m more shared unknowns after the others, and a covariance (k, k) added to these columns (k,).
+
+        `follow` (V, p, m) is how the own unknowns follow the new ones.
+        """
+        s = len(self.shared)
+        shared = np.zeros((s + follow.shape[2],) * 2)
+        shared[:s, :s] = self.shared
+        shared[np.ix_(columns, columns)] += added
+        return replace(self, shared=shared, follow=np.concatenate([self.follow, follow], axis=2))
 
 
 class SharedAndOwn(Generic[State]):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import Covariance
+from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
@@ -178,7 +178,7 @@ def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance)
         if state.model in WITH_XI:
             gradient = gradient - (free == 5) / (1 + state.k[0])
         n = len(gradient)
-        largest = max(largest, float(np.sqrt(gradient @ cov.entries[:n, :n] @ gradient)))
+        largest = max(largest, float(np.sqrt(gradient @ cov.shared[:n, :n] @ gradient)))
     return largest
 
 

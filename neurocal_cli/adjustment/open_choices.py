@@ -31,9 +31,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.board.prior import LEAN, STRETCH
-from neurocal_cli.adjustment.cross_validation import inverse_or_nan, quietly, reduced, solve_or_nan
-from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.adjustment.reprojection import free_columns, pose_response, stretched_blocks
+from neurocal_cli.adjustment.cross_validation import Minimum, inverse_or_nan, quietly, solve_or_nan
+from neurocal_cli.adjustment.normal_equations import (
+    Arrowhead,
+    Columns,
+    Covariance,
+    solve_scaled,
+    unit_diagonal,
+)
+from neurocal_cli.adjustment.reprojection import stretched_blocks
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -72,9 +78,7 @@ class OpenPrior:
 class SpreadOfOpen:
     """Posterior of the open unknowns o."""
 
-    # (o, o) term to add to the estimated covariance of the open unknowns, which is 0 for those left out; nan
-    # if the points do not determine those that were estimated.
-    E: Array
+    E: Array  # (o, o) term to add to the estimated covariance of the open unknowns, 0 for those left out
     follow: Array  # (f, o) [T; 1], the response of all free unknowns to the open ones
     probability: float  # posterior probability that any group is present
 
@@ -184,12 +188,14 @@ def open_at_points(
 
 
 @quietly
-def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> SpreadOfOpen:
-    """Posterior of the open unknowns by model averaging.
+def spread_of_open(arrow: Arrowhead, variance: float, prior: OpenPrior) -> SpreadOfOpen | None:
+    """Posterior of the open unknowns by model averaging; None if the points do not determine the others.
 
-    S (f, f) is the normal matrix of the free unknowns with the poses eliminated, and g (f,) its right side,
-    J^T r, at the reported values. `variance` is that of the residuals, enlarged if they are correlated.
+    The normal equations are those of all free unknowns at the reported values, the residual being observed
+    minus predicted. `variance` is that of the residuals, enlarged if they are correlated.
     """
+    reduced, _ = arrow.reduced()
+    S, g = reduced[:-1, :-1], reduced[:-1, -1]
     c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
     T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
     # Schur complement: J^T J and J^T r of the open unknowns at 0, with all others eliminated.
@@ -207,7 +213,24 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> Spr
     E = _beyond(np.einsum("m,mij->ij", weight, second), left, prior.left_out[prior.is_open])
     follow = np.zeros((len(prior.is_open), len(o)))
     follow[c], follow[o] = T, np.eye(len(o))
+    if not np.isfinite(E).all():
+        return None
     return SpreadOfOpen(E, follow, float(1.0 - weight[is_none].sum()))
+
+
+def opened(
+    found: Covariance, place: Columns, arrow: Arrowhead, spread: SpreadOfOpen, left_out: NDArray[np.bool_]
+) -> tuple[Covariance, Columns]:
+    """Add the spread of open unknowns to a covariance, with those that were left out as further unknowns.
+
+    `arrow` has all f free unknowns, `left_out` (f,) tells which of them were not estimated, and `place` are
+    the columns of the others in the covariance. The second result are the columns of all (f,).
+    """
+    columns = np.empty(len(left_out), dtype=np.intp)
+    columns[~left_out] = place
+    columns[left_out] = len(found.shared) + np.arange(int(left_out.sum()))
+    added = spread.follow @ spread.E @ spread.follow.T
+    return found.extended(columns, added, arrow.follow[:, :, left_out]), columns
 
 
 def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -245,37 +268,32 @@ _NEGLIGIBLE = 1e-3  # probability up to which the standard deviations stay uncha
 _NO_PRINT = 5.0  # standard deviations of prints and pixels together, beyond which it is no stretch of a print
 
 
-@frozen_dataclass(eq=False)
-class StretchedCovariance:
-    """Terms that an open stretch adds to the covariance of the free parameters (f, f) and poses (V, 6, 6).
+def open_stretch(found: Covariance, m: Minimum, world: Array, variance: float) -> tuple[Covariance, float]:
+    """The covariance with the stretch of a target (N, 3), and the probability that the print is stretched.
 
-    `probability` is that of a stretched print.
-    """
-
-    probability: float
-    entries: Array
-    poses: Array
-
-
-def open_stretch(
-    views: Views, state: CameraState, free: NDArray[np.bool_], world: Array, variance: float
-) -> StretchedCovariance | None:
-    """The term that the stretch of a target adds; None if it is negligible or the target is not flat.
-
-    The camera is at its minimum with free poses, for the given target (N, 3). The variance is that of the
-    residuals, enlarged if they are correlated.
+    The first columns are those of the free parameters of the camera, which is at its minimum for the given
+    target. The variance is that of the residuals, enlarged if they are correlated. The covariance stays as it
+    is, and the probability is 0, if the stretch is negligible or the target is not flat.
     """
     if not is_flat(world):
-        return None
-    normal = stretched_blocks(views.batches, state, stretches(world))
-    both = np.append(free, [True, True])
-    q = reduced(normal, both, True)
-    found = spread_of_stretch(q.S.sum(axis=0), q.g.sum(axis=0), variance)
-    if found is None:
-        return None
-    gain = pose_response(normal, free_columns(both)) @ found.follow
-    T = found.follow[:-2]
-    return StretchedCovariance(found.probability, T @ found.E @ T.T, gain @ found.E @ np.swapaxes(gain, 1, 2))
+        return found, 0.0
+    normal = stretched_blocks(m.views.batches, m.state, stretches(world))
+    arrow = replace(m, normal=normal, free=np.append(m.free, [True, True])).arrow
+    return with_stretch(found, np.arange(int(m.free.sum())), arrow, variance)
+
+
+def with_stretch(
+    found: Covariance, place: Columns, arrow: Arrowhead, variance: float
+) -> tuple[Covariance, float]:
+    """The same for any cameras, from the normal equations of the estimated parameters and the two stretches.
+
+    `place` are the columns of these parameters in the covariance.
+    """
+    spread = spread_of_stretch(arrow, variance)
+    if spread is None:
+        return found, 0.0
+    is_stretch = np.arange(len(place) + 2) >= len(place)
+    return opened(found, place, arrow, spread, is_stretch)[0], spread.probability
 
 
 def stretches(world: Array) -> Array:
@@ -294,16 +312,20 @@ def stretches(world: Array) -> Array:
     return np.stack([np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)])
 
 
-def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | None:
+def spread_of_stretch(arrow: Arrowhead, variance: float) -> SpreadOfOpen | None:
     """Posterior of the two stretches; None if they are negligible, or larger than those of prints.
 
-    S (f + 2, f + 2) is the normal matrix of the free parameters and the stretches with the poses eliminated,
-    g (f + 2,) its right side J^T r, and the variance that of the residuals.
+    The normal equations are those of the free parameters and, the last ones, the stretches. The variance is
+    that of the residuals.
     """
+    reduced, _ = arrow.reduced()
+    S, g = reduced[:-1, :-1], reduced[:-1, -1]
     is_open = np.arange(len(g)) >= len(g) - 2
     groups = (np.array([0]), np.array([1]))
     prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, STRETCH), groups, _ODDS_OF_PRINTS, (1.0,))
-    found = spread_of_open(S, g, variance, prior)
+    found = spread_of_open(arrow, variance, prior)
+    if found is None:
+        return None
     T = found.follow[:-2]
     left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance
     right = (g[-2:] + T.T @ g[:-2]) / variance

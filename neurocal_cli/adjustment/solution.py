@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import Covariance, covariance
+from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.reprojection import normal_blocks

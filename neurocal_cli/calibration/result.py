@@ -9,7 +9,6 @@ import numpy as np
 
 from neurocal_cli.adjustment.board.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
 from neurocal_cli.adjustment.covariance import (
-    Covariance,
     covariance_by_camera,
     entry_covariance,
     parameter_covariance,
@@ -18,6 +17,7 @@ from neurocal_cli.adjustment.covariance import (
     with_scale,
 )
 from neurocal_cli.adjustment.free_networks import seen_from_behind
+from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.observability import refuse_undetermined
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
 from neurocal_cli.adjustment.residual_correlation import point_residuals
@@ -65,7 +65,6 @@ def calibration_of(
         )
     )
     refuse_undetermined(problem, state, known.plain)
-    cov = known.found
     A = problem.matrix(state.entries[0])
     if problem.type != 3 and not problem.free[1]:
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
@@ -86,7 +85,7 @@ def calibration_of(
     elif not record.certain:
         reason = StopReason.NO_AGREEMENT
     chosen = solution.model_errors is not None
-    found, second = _with_second_poses(solution, _view_results(solution, cov, squared))
+    found, second = _with_second_poses(solution, _view_results(solution, known.found, squared))
     return Calibration(
         intrinsics=intrinsics,
         std=std,
@@ -151,11 +150,11 @@ def _entries(solution: Solution, known: CameraCovariance) -> Array:
     """
     free, ambiguity = solution.problem.free_camera, solution.ambiguity
     entries = np.zeros((len(free), len(free)))
-    entries[np.ix_(free, free)] = known.found.entries
+    entries[np.ix_(free, free)] = known.entries
     if ambiguity is None:
         return entries
     free[_XI] = True
-    inflation = known.found.entries[0, 0] / known.plain.entries[0, 0]  # for views that are not independent
+    inflation = known.entries[0, 0] / known.plain.shared[0, 0]  # for views that are not independent
     entries[np.ix_(free, free)] = ambiguity.widened(entries[np.ix_(free, free)], free, max(inflation, 1.0))
     return entries
 
@@ -169,9 +168,9 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
     if problem.poses is not None:
         R = np.stack([problem.poses[name].R for name in views.names])
         t = np.stack([problem.poses[name].t for name in views.names])
-    std = pose_std(R, centre, views.scale, cov.poses)
+    std = np.zeros((len(R), 6))
     if problem.free_poses:
-        std = with_scale(std, t, scale_of(problem.points).std)
+        std = with_scale(pose_std(R, centre, views.scale, cov.own), t, scale_of(problem.points).std)
     rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
     R.setflags(write=False)
     t.setflags(write=False)

@@ -269,9 +269,9 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     free = problem.free_camera
     cov = covariance(Minimum(views, state, normal, free, True), views.n_equations)
     entries = np.zeros((len(free),) * 2)
-    entries[np.ix_(free, free)] = cov.entries
+    entries[np.ix_(free, free)] = cov.shared
     _, std = parameter_covariance(camera.intrinsics, camera.model, entries, views.pixel_scale, problem.fixed)
-    poses = pose_std(R, (R @ views.centre[..., None])[..., 0], views.scale, cov.poses)
+    poses = pose_std(R, (R @ views.centre[..., None])[..., 0], views.scale, cov.own)
     if not cov.smallest > _SINGULAR:
         std, poses = {name: value and np.nan for name, value in std.items()}, np.full_like(poses, np.nan)
     order = [list(views.names).index(name) for name in scene.poses]

@@ -9,6 +9,7 @@ from support.distorted import bent_set, through
 from support.scenes import random_flat_set
 
 from neurocal_cli import calibrate
+from neurocal_cli.adjustment.normal_equations import Arrowhead
 from neurocal_cli.adjustment.open_choices import OpenPrior, spread_of_open
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
@@ -45,7 +46,9 @@ def test_the_spread_is_the_mean_square_around_what_is_reported() -> None:
             density = odds * likelihood * gaussian(x, scale * size)
             second += trapezoid(density * (x - value) ** 2, x)
             total += trapezoid(density, x)
-        spread = spread_of_open(np.array([[precision]]), np.array([gradient]), 1.0, prior)
+        arrow = Arrowhead.alone(np.array([[precision]]), np.array([gradient]), 0.0)
+        spread = spread_of_open(arrow, 1.0, prior)
+        assert spread is not None
         already = 0.0 if value == 0.0 else 1.0 / precision
         assert spread.E[0, 0] == pytest.approx(second / total - already, rel=1e-6)
         assert spread.probability == pytest.approx(1.0 - 2 * absent / total, rel=1e-6)

@@ -14,15 +14,15 @@ from support.targets import photographed
 from neurocal_cli import calibrate
 from neurocal_cli.adjustment import open_choices
 from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.cross_validation import Minimum
+from neurocal_cli.adjustment.normal_equations import Arrowhead
 from neurocal_cli.adjustment.open_choices import SpreadOfOpen, open_stretch, spread_of_stretch, stretches
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.rig import covariance
 from neurocal_cli.calibration.rig.adjust import adjust_rig
-from neurocal_cli.calibration.rig.covariance import covariance_of_stretch
+from neurocal_cli.calibration.rig.covariance import with_stretch_of
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.network.options import options_for
 
 EPS = 1e-6
@@ -46,15 +46,15 @@ def test_a_stretch_that_noise_hides_is_in_the_standard_deviations() -> None:
     assert chosen.verdict.measures["projection_px"] > by_name.verdict.measures["projection_px"]
 
 
-def only(which: int, monkeypatch: pytest.MonkeyPatch, module: object) -> None:
+def only(which: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """One of the stretches is there, with a std of 1; how all that is free follows is as it was found."""
 
-    def known(S: Array, g: Array, variance: float) -> SpreadOfOpen:
-        found = spread_of_stretch(S, g, 1e12)
+    def known(arrow: Arrowhead, variance: float) -> SpreadOfOpen:
+        found = spread_of_stretch(arrow, 1e12)
         assert found is not None
         return SpreadOfOpen(np.diag(np.eye(2)[which]), found.follow, 1.0)
 
-    monkeypatch.setattr(module, "spread_of_stretch", known)
+    monkeypatch.setattr(open_choices, "spread_of_stretch", known)
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -63,16 +63,17 @@ def test_the_camera_follows_a_stretch_as_a_fit_anew_does(which: int, monkeypatch
     problem = problem_for(points, 1, distortion=Distortion("k1k2"))
     solution = fit(problem, options_for("lm", 20, 0))
     views, free = solution.problem.views, solution.problem.free_camera
-    state = adjust(views.batches, solution.state, free, True, 20).state
-    only(which, monkeypatch, open_choices)
-    found = open_stretch(views, state, free, points.world, 1.0)
-    assert found is not None
+    adjusted = adjust(views.batches, solution.state, free, True, 20)
+    state, m = adjusted.state, Minimum(views, adjusted.state, adjusted.normal, free, True)
+    only(which, monkeypatch)
+    found, probability = open_stretch(m.arrow.covariance(0.0), m, points.world, 1.0)
+    assert probability == 1
     stretched = replace(views, local=views.local @ (np.eye(3) + EPS * stretches(points.world)[which]))
     new = adjust(stretched.batches, state, free, True, 20).state
     moved = np.concatenate([(new.entries - state.entries)[0], new.k - state.k])[free] / EPS
-    assert np.sqrt(np.diagonal(found.entries)) == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
+    assert np.sqrt(np.diagonal(found.shared)[:-2]) == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
     tau = (new.t - state.t) / EPS
-    std = np.sqrt(np.diagonal(found.poses[:, 3:, 3:], axis1=1, axis2=2))
+    std = np.sqrt(np.diagonal(found.own[:, 3:, 3:], axis1=1, axis2=2))
     assert std == pytest.approx(np.abs(tau), rel=5e-3, abs=1e-3)
 
 
@@ -83,9 +84,9 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     problem = stereo_problem(left, right, pair_views(left.points.view_names, right.points.view_names).both)
     free = np.concatenate([*problem.estimated, [True] * 6])
     adjusted = adjust_rig(problem, problem.start([scene.rig]), free)
-    only(0, monkeypatch, covariance)
-    found = covariance_of_stretch(adjusted)
-    assert found is not None
+    only(0, monkeypatch)
+    found, probability = with_stretch_of(adjusted.normal.covariance(0.0), adjusted)
+    assert probability == 1
     stretch = np.eye(3) + EPS * stretches(left.points.world)[0]
     observations = [
         replace(seen, views=replace(seen.views, local=seen.views.local @ stretch.T))
@@ -94,7 +95,10 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     problem = replace(problem, observations=(observations[0], observations[1]))
     new = adjust_rig(problem, adjusted.state, free).state
     moved = (new.t - adjusted.state.t)[1] / EPS
-    assert np.sqrt(np.diagonal(found[1]))[-3:] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
+    assert np.sqrt(np.diagonal(found.shared))[-5:-2] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
+    tau = (new.view_t - adjusted.state.view_t) / EPS
+    std = np.sqrt(np.diagonal(found.own[:, 3:, 3:], axis1=1, axis2=2))
+    assert std == pytest.approx(np.abs(tau), rel=5e-3, abs=1e-3)
 
 
 def test_the_spread_is_that_of_all_models() -> None:
@@ -102,7 +106,7 @@ def test_the_spread_is_that_of_all_models() -> None:
     size = open_choices.STRETCH
     variance, told, off = 0.25, np.array([1.2e-3, 0.8e-3]), np.array([2e-3, -0.3e-3])
     S = np.diag([1.0, *(variance / told**2)])
-    found = spread_of_stretch(S, np.append(0.0, off * variance / told**2), variance)
+    found = spread_of_stretch(Arrowhead.alone(S, np.append(0.0, off * variance / told**2), 0.0), variance)
     assert found is not None
     o = np.linspace(-0.02, 0.02, 20001)
     absent = 1.0
@@ -119,8 +123,8 @@ def test_the_spread_is_that_of_all_models() -> None:
 
 def test_what_is_negligible_or_no_print_leaves_standard_deviations_as_they_are() -> None:
     S = np.diag([1.0, 1e14, 1e14])
-    assert spread_of_stretch(S, np.zeros(3), 1.0) is None
-    assert spread_of_stretch(S, np.array([0.0, 1e14 * 0.03, 0.0]), 1.0) is None
+    assert spread_of_stretch(Arrowhead.alone(S, np.zeros(3), 0.0), 1.0) is None
+    assert spread_of_stretch(Arrowhead.alone(S, np.array([0.0, 1e14 * 0.03, 0.0]), 0.0), 1.0) is None
 
 
 @pytest.mark.parametrize(

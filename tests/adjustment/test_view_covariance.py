@@ -127,11 +127,11 @@ def test_the_covariance_is_nowhere_below_the_normal_matrix_s(monkeypatch: pytest
     given = Minimum(views, found.state, found.normal, NO_SKEW, True, own_poses(6)), views.n_equations
     noise = covariance(*given)
     counted = counting_views(noise, *given)
-    scale = np.sqrt(np.diagonal(noise.entries))
-    more = (counted.entries - noise.entries) / np.outer(scale, scale)
+    scale = np.sqrt(np.diagonal(noise.shared))
+    more = (counted.shared - noise.shared) / np.outer(scale, scale)
     assert np.linalg.eigvalsh(more).min() > -1e-9
     assert np.trace(more) > 0.01
-    assert (np.linalg.eigvalsh(counted.poses - noise.poses).min() > -1e-9 * noise.poses.max()).all()
+    assert (np.linalg.eigvalsh(counted.own - noise.own).min() > -1e-9 * noise.own.max()).all()
 
 
 def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
@@ -182,8 +182,8 @@ def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_
         free = np.ones(normal.shape[1] - 7, dtype=bool)
         given = Minimum(None, None, normal, free, True, own_poses(V)), V * rows
         plain = covariance(*given)
-        entries = counting_views(plain, *given).entries
-        return np.sqrt(np.diagonal(plain.entries)[:5]), np.sqrt(np.diagonal(entries)[:5])
+        entries = counting_views(plain, *given).shared
+        return np.sqrt(np.diagonal(plain.shared)[:5]), np.sqrt(np.diagonal(entries)[:5])
 
     plain, one = std(J, residual)
     _, both = std(J, again, residual)

@@ -89,7 +89,7 @@ def reference(scene: Scene, points: Correspondences, type: int, skew: bool, sigm
     share = 0.0
     if problem.free[0]:
         m = Minimum(views, start, normal, problem.free, problem.free_poses)
-        bound = covariance(m, 2 * len(points)).entries[0, 0]
+        bound = covariance(m, 2 * len(points)).shared[0, 0]
         share = float(np.sqrt(bound) / start.entries[0, 0])
     rmse = float(np.sqrt(fit.cost.sum() / len(points))) * views.pixel_scale
     return Reference(rmse, share)

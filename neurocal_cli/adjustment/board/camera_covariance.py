@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, counting_views, covariance
+from neurocal_cli.adjustment.covariance import CovarianceBasis, counting_views, covariance
 from neurocal_cli.adjustment.cross_validation import Minimum
-from neurocal_cli.adjustment.reprojection import normal_blocks, pose_response
+from neurocal_cli.adjustment.normal_equations import Covariance
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -76,10 +77,17 @@ class CameraCovariance:
 
     basis: CovarianceBasis
     plain: Covariance  # from the normal matrices alone
-    found: Covariance  # with the jackknife over views and the model uncertainty
+    # With the jackknife over views and the model uncertainty; open unknowns come after the f free parameters.
+    found: Covariance
     wide: WideCovariance | None = None  # None if the model selection leaves no coefficient open
     # Probability that the print is stretched, if the given target was kept; 0 if it is negligible.
     stretched: float = 0.0
+
+    @property
+    def entries(self) -> Array:
+        """(f, f) of A's free entries and the free distortion coefficients."""
+        f = len(self.plain.shared)
+        return self.found.shared[:f, :f]
 
 
 def camera_covariance(seen: CameraSeen) -> CameraCovariance:
@@ -91,7 +99,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     m, n = basis.minimum, basis.n_equations
     plain = seen.plain or covariance(m, n + seen.by_prior, basis.shared)
     if basis.poses is not None:
-        plain = replace(plain, poses=basis.poses)
+        plain = replace(plain, alone=plain.alone + basis.poses - plain.own)
     if seen.shared is not None:
         return CameraCovariance(basis, plain, plain)
     grown = np.inf  # a surveyed target absorbs no more than the stated errors of its points
@@ -102,13 +110,13 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     found = counting_views(plain, m, n, basis.moves_without, grown)
     known = CameraCovariance(basis, plain, found)
     kept = seen.target_kept and m.free_poses and bool(m.free.any())
-    if not np.isfinite(found.entries).all() or not (seen.choice or kept):
+    if not np.isfinite(found.shared).all() or not (seen.choice or kept):
         return known
     variance = _variance(seen, basis)
     if not variance > 0:
         return known
-    known = _chosen(seen, known, variance) if seen.choice else known
-    return _stretched(seen, known, variance) if kept else known
+    known = _stretched(seen, known, variance) if kept else known
+    return _chosen(seen, known, variance) if seen.choice else known
 
 
 def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
@@ -128,38 +136,21 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     state = richer.state(state)
     normal, _ = normal_blocks(views.batches, state)
     m = _basis(seen, replace(m, state=state, normal=normal, free=richer.free)).minimum
-    q = m.quadratics
-    left_out = richer.prior.left_out
-    spread = choices.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
-    E, follow = spread.E, spread.follow
-    entries = follow @ E @ follow.T
-    entries[np.ix_(~left_out, ~left_out)] += known.found.entries
-    if not np.isfinite(entries).all():
+    spread = choices.spread_of_open(m.arrow, variance, richer.prior)
+    if spread is None:
         return known
-    poses = known.found.poses
-    if m.free_poses:
-        gain = pose_response(m.normal, m.columns) @ follow
-        poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
-    found = replace(known.found, entries=entries[np.ix_(~left_out, ~left_out)], poses=poses)
-    return replace(known, found=found, wide=WideCovariance(richer, m.normal, entries))
+    left_out, f = richer.prior.left_out, len(known.plain.shared)
+    found, columns = choices.opened(known.found, np.arange(f), m.arrow, spread, left_out)
+    wide = WideCovariance(richer, m.normal, found.shared[np.ix_(columns, columns)])
+    return replace(known, found=found, wide=wide)
 
 
 def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """Add the uncertainty from keeping the given target."""
     from neurocal_cli.adjustment.open_choices import open_stretch
 
-    m = seen.minimum
-    added = open_stretch(m.views, m.state, m.free, seen.points.world, variance)
-    if added is None:
-        return known
-    entries, poses = known.found.entries + added.entries, known.found.poses + added.poses
-    found, wide = replace(known.found, entries=entries, poses=poses), known.wide
-    if wide is not None:
-        everything = wide.entries.copy()
-        estimated = ~wide.open.prior.left_out
-        everything[np.ix_(estimated, estimated)] += added.entries
-        wide = replace(wide, entries=everything)
-    return replace(known, found=found, wide=wide, stretched=added.probability)
+    found, probability = open_stretch(known.found, seen.minimum, seen.points.world, variance)
+    return replace(known, found=found, stretched=probability)
 
 
 def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:

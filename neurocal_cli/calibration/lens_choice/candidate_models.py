@@ -311,7 +311,7 @@ def _assessed(
     cov = covariance(m, views.n_equations)
     if repeated is not None:
         cov = counting_views(cov, m, views.n_equations)
-    noise = _noise(problem.distortion.model, state, reach, cov.entries)
+    noise = _noise(problem.distortion.model, state, reach, cov.shared)
     bad = folds_back(problem, state)
     try:
         refuse_undetermined(problem, state, cov)
@@ -348,7 +348,7 @@ def falls_short(fitted: Iterable[Candidate]) -> bool:
 def _is_decentred(omnidir: Candidate) -> bool:
     """Whether p1 and p2 differ from 0, by as many residuals as are independent."""
     problem, views, state = omnidir.problem, omnidir.problem.views, omnidir.adjusted.state
-    C = covariance(problem.minimum(omnidir.adjusted), views.n_equations).entries[-2:, -2:]
+    C = covariance(problem.minimum(omnidir.adjusted), views.n_equations).shared[-2:, -2:]
     if not np.isfinite(C).all():
         return False
     told = state.k[-2:] @ np.linalg.pinv(C, hermitian=True) @ state.k[-2:]

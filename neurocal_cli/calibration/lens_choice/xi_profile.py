@@ -162,7 +162,7 @@ class _Profile:
         problem, best = self.problem, self.best
         free = problem.free_camera
         cov = covariance(problem.minimum(best), problem.views.n_equations)
-        variance = float(cov.entries[int(free[:5].sum()), int(free[:5].sum())])
+        variance = float(cov.shared[int(free[:5].sum()), int(free[:5].sum())])
         if not variance > 0 or not cov.smallest > 1e-12:
             return False
         for one in self.tried:

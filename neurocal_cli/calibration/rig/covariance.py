@@ -6,9 +6,8 @@
   differences (Efron and Stein 1981).
 * A target that was estimated with the cameras, and so is uncertain as well (`with_target_uncertainty`).
 * Unknowns that the common fit left out. They are open unknowns of the common bundle adjustment, as for a
-  single camera: coefficients that the selected distortion models lack (`covariance_of_choice`, see
-  `adjustment.open_choices`), and two stretches of the print if the given target was kept
-  (`covariance_of_stretch`, see `open_choices`).
+  single camera (`adjustment.open_choices`): coefficients that the selected distortion models lack
+  (`with_choice`), and two stretches of the print if the given target was kept (`with_stretch_of`).
 * Cameras that were given with a covariance S of their own (`covariance_by_given`). The rig, a second camera
   and the poses follow an error d of the given cameras as they would follow these parameters if they were
   estimated: with the poses eliminated, N_ff x + N_fd d = 0 for the free shared unknowns x. So x has the
@@ -32,18 +31,18 @@ from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
-from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SchurCovariance, solve_scaled
+from neurocal_cli.adjustment.normal_equations import ROUNDING, Covariance, solve_scaled
 from neurocal_cli.adjustment.open_choices import (
     OpenCoefficients,
     OpenPrior,
     open_at_points,
+    opened,
     spread_of_open,
-    spread_of_stretch,
     stretches,
+    with_stretch,
 )
 from neurocal_cli.adjustment.reprojection import camera_columns, stretched_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
-from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
@@ -145,50 +144,50 @@ def information_of_rig(target: Target, fit: RigFit) -> Information:
     return Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
 
 
-def covariance_of_choice(fit: RigFit) -> Array | None:
-    """Covariance that the model selection adds to the free shared unknowns; None if it adds none.
+def with_choice(found: Covariance, fit: RigFit) -> Covariance:
+    """Add what the selection of the distortion models leaves open to a covariance of all shared unknowns.
 
     The models of two cameras are weighed together, those of more cameras camera by camera.
     """
     sides = list(range(len(fit.problem.cameras)))
-    found = [_covariance_of(fit, some) for some in ([sides] if len(sides) == 2 else [[k] for k in sides])]
-    added = [one for one in found if one is not None]
-    return np.sum(added, axis=0) if added else None
+    for some in [sides] if len(sides) == 2 else [[k] for k in sides]:
+        found = _with_choice_of(found, fit, some)
+    return found
 
 
-def _covariance_of(fit: RigFit, sides: Sequence[int]) -> Array | None:
+def _with_choice_of(found: Covariance, fit: RigFit, sides: Sequence[int]) -> Covariance:
     """The same for the models of some of the cameras."""
     problem, before = fit.problem, fit.state
     own = [fit.free[place] for place in before.columns.cameras]
-    opened: list[OpenCoefficients | None] = [None] * len(own)
+    opened_cameras: list[OpenCoefficients | None] = [None] * len(own)
     for side in sides:
         calibration, free = problem.calibrations[side], own[side]
         # A camera that the common bundle adjustment did not change has no open coefficients either.
         if free.any():
             points, choice = calibration.points, tuple(calibration.lens_choice)
             alone = replace(calibration.state(points.view_names), k=before.cameras[side].k)
-            opened[side] = open_at_points(alone, points, free, choice)
-    if not any(found is not None for found in opened):
-        return None
+            opened_cameras[side] = open_at_points(alone, points, free, choice)
+    if not any(one is not None for one in opened_cameras):
+        return found
     cameras = tuple(
-        camera if found is None else found.state(camera)
-        for camera, found in zip(before.cameras, opened, strict=True)
+        camera if one is None else one.state(camera)
+        for camera, one in zip(before.cameras, opened_cameras, strict=True)
     )
     state = replace(before, cameras=cameras)
     parts = []
-    for found, free in zip([*opened, None], [*own, fit.free[-problem.n_rig :]], strict=True):
+    for one, free in zip([*opened_cameras, None], [*own, fit.free[-problem.n_rig :]], strict=True):
         none = np.zeros(int(free.sum()), dtype=bool)
-        if found is None:
+        if one is None:
             parts.append((free, none, none))
         else:
-            parts.append((found.free, found.prior.is_open, found.prior.left_out))
+            parts.append((one.free, one.prior.is_open, one.prior.left_out))
     all_free, is_open, left_out = (np.concatenate(part) for part in zip(*parts, strict=True))
-    prior = _joined(is_open, left_out, [found.prior for found in opened if found is not None])
-    whole = problem.normal(state)[0].only(np.flatnonzero(all_free)).reduced()[0]
-    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], fit.variance, prior)
-    follow = spread.follow[~prior.left_out]
-    added = follow @ spread.E @ follow.T
-    return added if np.isfinite(added).all() else None
+    prior = _joined(is_open, left_out, [one.prior for one in opened_cameras if one is not None])
+    arrow = problem.normal(state)[0].only(np.flatnonzero(all_free))
+    spread = spread_of_open(arrow, fit.variance, prior)
+    if spread is None:
+        return found
+    return opened(found, np.flatnonzero(fit.free), arrow, spread, left_out)[0]
 
 
 def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: list[OpenPrior]) -> OpenPrior:
@@ -200,40 +199,27 @@ def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: lis
     return OpenPrior(is_open, left_out, value, size, tuple(groups), odds)
 
 
-def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
-    """Probability that the print of a target is stretched, and the covariance that this adds.
+def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:
+    """Add the stretch of the print to a covariance of all shared unknowns; and the probability of a stretch.
 
-    The covariance (f, f) is of the free shared unknowns of a fit to the target as given. None if the stretch
-    is negligible or the target is not flat. Cameras that were not refined respond to the stretch as well,
-    because they were calibrated on this target.
+    The probability is 0 if the stretch is negligible or the target is not flat. Cameras that were not refined
+    respond to the stretch as well, because they were calibrated on this target.
     """
     world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
     if not is_flat(world) or not fit.variance > 0:
-        return None
-    estimated, n = fit.problem.estimated_shared, fit.state.columns.n_shared
+        return found, 0.0
+    estimated, n = np.flatnonzero(fit.problem.estimated_shared), fit.state.columns.n_shared
     blocks = [
         stretched_blocks(observed.views.batches, fit.problem.camera(fit.state, side), stretches(world))
         for side, observed in enumerate(fit.problem.observations)
     ]
-    kept = np.append(np.flatnonzero(estimated), [n, n + 1])
-    views = fit.problem.view_equations(fit.state, blocks)
-    whole = fit.problem.gathered(views).only(kept).reduced()[0]
-    found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)
-    if found is None:
-        return None
-    T = found.follow[:-2][fit.free[estimated]]
-    return found.probability, T @ found.E @ T.T
+    arrow = fit.problem.gathered(fit.problem.view_equations(fit.state, blocks))
+    return with_stretch(found, estimated, arrow.only(np.append(estimated, [n, n + 1])), fit.variance)
 
 
-def covariance_by_given(
-    problem: RigProblem, state: RigState, normal: Arrowhead, free: NDArray[np.bool_]
-) -> SchurCovariance | None:
-    """Covariance of all shared unknowns and of the poses that the given cameras cause, normalised.
-
-    `normal` is that at the state, which is a minimum, and `free` (n_shared,) are the unknowns that moved.
-    None if no covariance is known.
-    """
-    columns = state.columns
+def covariance_by_given(fit: RigFit) -> Array:
+    """(n_shared, n_shared) covariance of all shared unknowns that the given cameras cause, normalised."""
+    problem, columns, free = fit.problem, fit.state.columns, fit.free
     given = np.zeros((columns.n_shared, columns.n_shared))
     for camera, seen, place in zip(problem.calibrations, problem.observations, columns.cameras, strict=True):
         if camera.given_names:
@@ -245,13 +231,9 @@ def covariance_by_given(
                 seen.views.pixel_scale,
             )
     if not given.any():
-        return None
-    whole, by_shared = (part[..., :-1] for part in normal.reduced())
-    whole = whole[:-1]
+        return given
+    whole = fit.normal.reduced()[0][:-1, :-1]
     follow = np.eye(columns.n_shared)
     follow[free] = -solve_scaled(whole[np.ix_(free, free)], whole[free])
     follow[np.ix_(free, free)] = 0.0  # the free unknowns themselves have no error of their own here
-    shared = follow @ given @ follow.T
-    by_shared = -by_shared
-    cross = np.swapaxes(by_shared @ shared, 1, 2)
-    return SchurCovariance(shared, by_shared @ shared @ np.swapaxes(by_shared, 1, 2), cross, 1.0)
+    return np.asarray(follow @ given @ follow.T)

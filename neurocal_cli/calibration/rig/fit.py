@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.covariance import not_smaller
+from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
 from neurocal_cli.calibration.rig.assessment import assess_rig
@@ -22,7 +23,9 @@ from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, with_agre
 from neurocal_cli.calibration.rig.contradictions import LeftOut, told_left_out, without_contradictions
 from neurocal_cli.calibration.rig.covariance import (
     contradicting_covariance,
-    covariance_of_stretch,
+    covariance_by_given,
+    with_choice,
+    with_stretch_of,
     with_target_uncertainty,
 )
 from neurocal_cli.calibration.rig.edges import (
@@ -38,11 +41,12 @@ from neurocal_cli.calibration.rig.refinement import with_board
 from neurocal_cli.calibration.rig.result import RigAssembly
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import TOLD
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
+from neurocal_cli.observations.target import Target
 
 _HERE = Pose(np.eye(3), np.zeros(3))
+_SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
 
 
 def fit_rig(
@@ -97,16 +101,14 @@ def fit_rig(
     if target is not None and common:
         fit = with_board(fit, target, lambda within, start: adjust_rig(within, start, fit.free))
         target = fit.problem.calibrations[0].target
-    least, stretched = _covariance(fit), None
-    if target is not None and common:
-        uncertain = with_target_uncertainty(target, fit)
-        least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
+    found = _covariance(fit, target if common else None)
+    stretched = 0.0
     if target_kept or any(camera.target_stretched for camera in cameras.values()):
-        stretched = covariance_of_stretch(fit)
-    if target_kept and stretched is not None:
-        kept = tuple(replace(camera, target_stretched=stretched[0]) for camera in fit.problem.calibrations)
+        found, stretched = with_stretch_of(found, fit)
+    if target_kept and stretched:
+        kept = tuple(replace(camera, target_stretched=stretched) for camera in fit.problem.calibrations)
         fit = replace(fit, problem=replace(fit.problem, calibrations=kept))
-    rig = _assembled(fit, names, least, None if stretched is None else stretched[1])
+    rig = _assembled(fit, names, found)
     if left_out:
         warnings.insert(0, told_left_out(left_out, problem, names))
     rig = replace(
@@ -158,21 +160,35 @@ def _refuse_one_place(rig: Rig) -> None:
         )
 
 
-def _covariance(fit: RigFit) -> Array | None:
-    """Covariance of the free shared unknowns if that of independent points is too small; else None.
+def _covariance(fit: RigFit, target: Target | None) -> Covariance:
+    """Covariance of all shared unknowns, 0 for those that were not moved, and of the frames' poses.
 
-    It is that of all unknowns that the points determine, also of cameras that were not refined.
+    It is not smaller than that of frames that contradict each other, or than that with the uncertain target.
+    Points that do not determine the unknowns are an error.
     """
-    estimated = fit.problem.estimated_shared
+    free = np.flatnonzero(fit.free)
+    found = fit.normal.only(free).covariance(fit.variance)
+    if not found.smallest > _SINGULAR:
+        raise DegenerateGeometryError(
+            "the points do not determine the rig and its cameras (the normal matrix is singular); "
+            "spread them in depth, or give known parameters (--no-skew, or known cameras)"
+        )
+    shared, estimated = found.shared, fit.problem.estimated_shared
     if is_significant(*scatter(fit)) or (fit.free != estimated).any():
+        # That of all unknowns that the points determine, also of cameras that were not refined.
         whole = contradicting_covariance(replace(fit, free=estimated))
         moved = fit.free[estimated]
-        return whole[np.ix_(moved, moved)]
-    return None
+        shared = not_smaller(shared, whole[np.ix_(moved, moved)])
+    if target is not None:
+        uncertain = with_target_uncertainty(target, fit)
+        shared = shared if uncertain is None else not_smaller(shared, uncertain)
+    of_all = covariance_by_given(fit)
+    of_all[np.ix_(free, free)] += shared
+    return with_choice(replace(found, shared=of_all, follow=fit.normal.follow), fit)
 
 
-def _assembled(fit: RigFit, names: list[str], least: Array | None, stretched: Array | None) -> Rig:
-    found = RigAssembly(fit, least, stretched)
+def _assembled(fit: RigFit, names: list[str], covariance: Covariance) -> Rig:
+    found = RigAssembly(fit, covariance)
     cameras = dict(zip(names, found.cameras, strict=True))
     none = dict.fromkeys((*POSE_NAMES, "baseline"), 0.0)
     first = next(iter(cameras.values()))

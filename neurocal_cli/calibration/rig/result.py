@@ -10,63 +10,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.covariance import (
-    not_smaller,
     parameter_covariance,
     parameter_warnings,
     pose_std,
     with_scale,
 )
-from neurocal_cli.adjustment.normal_equations import SchurCovariance, solve_scaled
+from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
-from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
-from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.target import scale_of
-
-_SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
 
 
 class RigAssembly:
     """An adjusted rig in pixels and world units.
 
-    `least` (f, f) is a lower bound of the covariance of the free shared parameters, normalised. `stretched`
-    is the covariance to add to it because the print may be stretched. Points that do not determine the
-    parameters are an error.
+    `found` is the covariance of all shared unknowns, normalised, with further ones after them.
     """
 
-    def __init__(self, fit: RigFit, least: Array | None, stretched: Array | None) -> None:
+    def __init__(self, fit: RigFit, found: Covariance) -> None:
         self.fit, self.problem, self.state, self.columns = fit, fit.problem, fit.state, fit.state.columns
         self.scale_std = scale_of(self.problem.calibrations[0].points).std
-        self.shared = np.flatnonzero(fit.free)
-        inverse = fit.normal.only(self.shared).covariance()
-        if not inverse.smallest > _SINGULAR:
-            raise DegenerateGeometryError(
-                "the points do not determine the rig and its cameras (the normal matrix is singular); "
-                "spread them in depth, or give known parameters (--no-skew, or known cameras)"
-            )
-        blocks = {name: fit.variance * getattr(inverse, name) for name in ("shared", "own", "cross")}
-        covariance = replace(inverse, **blocks)
-        if least is not None:
-            covariance = _widened(covariance, not_smaller(covariance.shared, least))
-        for more in (covariance_of_choice(fit), stretched):
-            if more is not None:
-                covariance = _widened(covariance, covariance.shared + more)
-        given = covariance_by_given(self.problem, self.state, fit.normal, fit.free)
-        if given is not None:
-            covariance = replace(
-                covariance,
-                shared=covariance.shared + given.shared[np.ix_(self.shared, self.shared)],
-                own=covariance.own + given.own,
-                cross=covariance.cross + given.cross[:, self.shared],
-            )
-        self._normalised = covariance
+        self.found = found
         self.poses = [
             Pose(R, t * self.problem.unit) for R, t in zip(self.state.R[1:], self.state.t[1:], strict=True)
         ]
@@ -115,11 +86,8 @@ class RigAssembly:
 
     def _shared_block(self, columns: NDArray[np.intp]) -> Array:
         """Covariance of some of the shared parameters, 0 for given ones."""
-        free = np.flatnonzero(self.fit.free[columns])
-        rows = np.searchsorted(self.shared, columns[free])
-        block = np.zeros((len(columns), len(columns)))
-        block[np.ix_(free, free)] = self._normalised.shared[np.ix_(rows, rows)]
-        return block
+        free = self.fit.free[columns]
+        return np.where(np.outer(free, free), self.found.shared[np.ix_(columns, columns)], 0.0)
 
     def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
         """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
@@ -187,23 +155,13 @@ class RigAssembly:
             self.problem.observations[side].view,
             self.problem.pose_steps(self.state, side),
         )
-        covariance = by_pose @ self._normalised.own[view] @ np.swapaxes(by_pose, 1, 2)
+        covariance = by_pose @ self.found.own[view] @ np.swapaxes(by_pose, 1, 2)
         if of_rig.size:
-            rows = np.searchsorted(self.shared, of_rig)  # the rig's unknowns always move
-            mixed = by_rig @ self._normalised.cross[view][:, rows] @ np.swapaxes(by_pose, 1, 2)
+            mixed = by_rig @ self.found.cross[view][:, of_rig] @ np.swapaxes(by_pose, 1, 2)
             covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
             covariance += by_rig @ self._shared_block(of_rig) @ np.swapaxes(by_rig, 1, 2)
         centre = (R @ self.problem.centre[view][..., None])[..., 0]
         return pose_std(R, centre, self.problem.scale[view], covariance)
-
-
-def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
-    """Replace the covariance of the shared unknowns, and propagate the change to the own ones."""
-    V, f, p = covariance.cross.shape
-    columns = covariance.cross.swapaxes(0, 1).reshape(f, V * p)
-    follow = solve_scaled(covariance.shared, columns).reshape(f, V, p).swapaxes(0, 1)
-    more = np.swapaxes(follow, 1, 2) @ (shared - covariance.shared) @ follow
-    return replace(covariance, shared=shared, own=covariance.own + more, cross=shared @ follow)
 
 
 def non_monotonic_sides(fit: RigFit) -> list[int]:

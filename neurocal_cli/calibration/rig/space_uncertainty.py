@@ -117,13 +117,12 @@ def point_moves(
 def shared_covariance(fit: RigFit) -> Array:
     """(n_shared, n_shared) covariance of what the frames share: of the fit, and of given cameras."""
     free = np.flatnonzero(fit.free)
-    shared = np.zeros((len(fit.free), len(fit.free)))
+    shared = covariance_by_given(fit)
     if is_significant(*scatter(fit)):
-        shared[np.ix_(free, free)] = contradicting_covariance(fit)
+        shared[np.ix_(free, free)] += contradicting_covariance(fit)
     else:
-        shared[np.ix_(free, free)] = fit.variance * fit.normal.only(free).covariance().shared
-    given = covariance_by_given(fit.problem, fit.state, fit.normal, fit.free)
-    return shared if given is None else shared + given.shared
+        shared[np.ix_(free, free)] += fit.normal.only(free).covariance(fit.variance).shared
+    return shared
 
 
 def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:

@@ -203,8 +203,8 @@ class _AtMinimum:
         self.spare = max(known.basis.n_equations - self.unknowns, 1)
         self.variance = self.cost / self.spare
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
-        self.covariance, self.wide = known.found.entries, known.wide
-        self.pose_covariance = known.found.poses
+        self.covariance, self.wide = known.entries, known.wide
+        self.pose_covariance = known.found.own
         if calibration.given_names:
             by_camera = covariance_by_camera(self.views, self.state, self._covariance_of_given())
             self.pose_covariance = self.pose_covariance + by_camera
@@ -335,8 +335,10 @@ class _AtMinimum:
             views, state, self.free, self.free_poses, self.points.image_size, named_lens=not selected,
             worth=self.repeated.worth, shaped=target is not None and target.bends is None,
         )  # fmt: skip
+        if held is None or not self.free_poses:
+            return held
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
-        return held and replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
+        return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
 
     def _of_given(self) -> list[Finding]:
         """What the points say against a given centre that the lens or the target hides."""
