@@ -173,15 +173,14 @@ def _covariance(fit: RigFit, target: Target | None) -> Covariance:
             "the points do not determine the rig and its cameras (the normal matrix is singular); "
             "spread them in depth, or give known parameters (--no-skew, or known cameras)"
         )
-    shared, estimated = found.shared, fit.problem.estimated_shared
+    estimated = fit.problem.estimated_shared
+    least = None if target is None else with_target_uncertainty(target, fit)
     if is_significant(*scatter(fit)) or (fit.free != estimated).any():
         # That of all unknowns that the points determine, also of cameras that were not refined.
-        whole = contradicting_covariance(replace(fit, free=estimated))
-        moved = fit.free[estimated]
-        shared = not_smaller(shared, whole[np.ix_(moved, moved)])
-    if target is not None:
-        uncertain = with_target_uncertainty(target, fit)
-        shared = shared if uncertain is None else not_smaller(shared, uncertain)
+        whole, moved = contradicting_covariance(replace(fit, free=estimated)), fit.free[estimated]
+        by_frames = whole[np.ix_(moved, moved)]
+        least = by_frames if least is None else not_smaller(by_frames, least)
+    shared = found.shared if least is None else not_smaller(found.shared, least)
     of_all = covariance_by_given(fit)
     of_all[np.ix_(free, free)] += shared
     return with_choice(replace(found, shared=of_all, follow=fit.normal.follow), fit)
