@@ -133,13 +133,12 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
     variance = normal[:, 11, 11].sum() / (2 * len(scene.view) - len(whole))
     expected = variance * np.linalg.inv(whole)
     found = covariance(Minimum(views, state, normal, np.array(free, bool), poses), 2 * len(scene.view))
-    np.testing.assert_allclose(found.entries, expected[: len(f), : len(f)], rtol=1e-8)
-    for k in range(5):
+    np.testing.assert_allclose(found.shared, expected[: len(f), : len(f)], rtol=1e-8)
+    assert found.own.shape == (5, 6 * poses, 6 * poses)
+    for k in range(5 * poses):
         mine = slice(len(f) + 6 * k, len(f) + 6 * k + 6)
-        block = expected[mine, mine] if poses else np.zeros((6, 6))
-        np.testing.assert_allclose(
-            found.poses[k], block, rtol=1e-7, atol=1e-9 * np.abs(block).max(initial=0.0)
-        )
+        block = expected[mine, mine]
+        np.testing.assert_allclose(found.own[k], block, rtol=1e-7, atol=1e-9 * np.abs(block).max())
     assert found.smallest > 0
 
 

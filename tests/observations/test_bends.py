@@ -78,9 +78,9 @@ def test_bends_are_integrated_out_of_what_each_view_tells() -> None:
     target, (problem, adjusted) = found().target, fit_of(found())
     basis = covariance_basis(target, problem.minimum(adjusted), problem.points)
     assert basis.shared is not None
-    views = covariance(basis.minimum, basis.n_equations).entries
+    views = covariance(basis.minimum, basis.n_equations).shared
     np.testing.assert_allclose(np.diagonal(views), np.diagonal(basis.shared), rtol=0.02)
-    fixed = covariance(problem.minimum(adjusted), basis.n_equations).entries
+    fixed = covariance(problem.minimum(adjusted), basis.n_equations).shared
     assert (np.diagonal(fixed) < np.diagonal(basis.shared)).all()
 
 

@@ -53,7 +53,7 @@ def reference(points: Correspondences, truth: Truth) -> Reference:
         normal = best.normal.copy()
         normal[:, -1, -1] = 2 * problem.views.counts * (truth.sigma / problem.views.pixel_scale) ** 2
     cov = covariance(problem.minimum(replace(best, normal=normal)), problem.views.n_equations)
-    spread = float(np.sqrt(cov.entries[0, 0]) / best.state.entries[0, 0])
+    spread = float(np.sqrt(cov.shared[0, 0]) / best.state.entries[0, 0])
     return Reference(truth, spread if np.isfinite(spread) else np.inf)
 
 
