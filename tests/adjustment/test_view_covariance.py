@@ -92,7 +92,7 @@ def test_errors_of_clean_views_are_as_the_std_say(n_views: int) -> None:
 
 def noise_std(views: Views, found: Calibration) -> float:
     """Std of alpha_u from the normal matrix alone."""
-    entries = covariance(_AtMinimum(found).minimum, views.n_equations).entries
+    entries = covariance(_AtMinimum(found).minimum, views.n_equations).shared
     return float(np.sqrt(entries[0, 0])) * views.pixel_scale
 
 
