@@ -41,14 +41,13 @@ from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds, pixel_spr
 from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import estimates
-from neurocal_cli.calibration.verdict.rivals import RIVALS, TOO_SIMPLE
+from neurocal_cli.calibration.verdict.rivals import RIVALS
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.network.options import options_for
 from neurocal_cli.observations.points import Correspondences
 
-_FAR = 2.0  # times the log evidence of the found target
 _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
 
 # Of one view. Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean
@@ -68,40 +67,24 @@ _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 _BENT = replace(next(one for one in RIVALS if one.effect is bends), patterns=common)
 
 
-def has_other_cause(solution: Solution, found: Found) -> bool:
-    """Whether the errors on the given target have another cause than its shape."""
-    problem = solution.problem
-    if contradicts_sigma(solution):
-        return True
-    named = solution.model_errors is None and solution.straight_lines is None
-    # One or two views of planes that bend and were set up by hand show distortion as another target.
-    if named and problem.views.n_views < _TELL_BENDS and richer_lens_is_better(found):
-        return True
-    fits = views_for_target([(problem, solution.adjusted)])
-    held, gain = contest_of(solution, fits[0]), gain_over_given(found, fits)
-    if held is None or not held.causes:
-        return False
-    # An equation of the contest, which is on the given target, may count less on the found one.
-    worth = min(counted_again(found, fits), 1.0)
-    if held.beside_board:
-        return held.evidence * worth > gain + LEVEL
-    # A shape that is far more probable than the found one is not open: no print is stretched by percents.
-    return held.causes[0].pattern == "all" and worth * sum(one.evidence for one in held.causes) > _FAR * gain
+def has_other_cause(
+    fits: Sequence[tuple[Problem, Adjusted]], found: Found, named_lens: bool, worth: float = 1.0
+) -> bool:
+    """Whether the errors on the given target have another cause than the shape that was found.
 
-
-def lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
-    """Whether more distortion coefficients are more probable than a target found with the same lenses.
-
-    Each camera is at its minimum for the given target.
+    Each camera is at its minimum for the given target. `worth` is the effective share of the views if they
+    repeat poses.
     """
+    # One or two views of planes that bend and were set up by hand show distortion as another target.
+    n_views = sum(problem.views.n_views for problem, _ in fits)
+    if named_lens and n_views < _TELL_BENDS and richer_lens_is_better(found):
+        return True
     fits = views_for_target(fits)
-    held = [
-        contest(problem.views, adjusted.state, problem.free_camera, problem.free_poses,
-                problem.points.image_size, named_lens=not problem.distortion.wide)
-        for problem, adjusted in fits
-    ]  # fmt: skip
-    of_lens = [one.evidence for one in held if one and one.causes and one.causes[0].rival.cause == TOO_SIMPLE]
-    return sum(of_lens) > gain_over_given(found, fits)
+    held = [_contest_at(fit, named_lens, worth) for fit in fits]
+    # An equation of the contest, which is on the given target, may count less on the found one.
+    counted = min(counted_again(found, fits), 1.0)
+    others = sum(one.instead_of_target(counted) for one in held if one is not None)
+    return others > gain_over_given(found, fits)
 
 
 def contradicts_sigma(solution: Solution) -> bool:
@@ -118,26 +101,18 @@ def contest_of(
     solution: Solution, fit: tuple[Problem, Adjusted] | None = None, shaped: bool = False
 ) -> Contest | None:
     """The contest at a fit, by default that of the solution, whose target's shape was estimated or not."""
-    problem, adjusted = fit or (solution.problem, solution.adjusted)
+    fit = fit or (solution.problem, solution.adjusted)
+    return _contest_at(fit, solution.has_named_lens, solution.repeated.worth, shaped)
+
+
+def _contest_at(
+    fit: tuple[Problem, Adjusted], named_lens: bool, worth: float, shaped: bool = False
+) -> Contest | None:
+    problem, adjusted = fit
     return contest(
         problem.views, adjusted.state, problem.free_camera, problem.free_poses, problem.points.image_size,
-        named_lens=solution.model_errors is None and solution.straight_lines is None,
-        worth=solution.repeated.worth, shaped=shaped,
+        named_lens=named_lens, worth=worth, shaped=shaped,
     )  # fmt: skip
-
-
-def other_causes(solution: Solution, fit: tuple[Problem, Adjusted], shaped: bool) -> float:
-    """Log odds of other causes of a fit's errors than the target's shape, known or not; 0 if there are none.
-
-    The level by which they have to beat the target's shape is taken off. `shaped` tells whether its common
-    shape is estimated.
-    """
-    held = contest_of(solution, fit, shaped)
-    if held is None or not held.causes:
-        return 0.0
-    first = held.causes[0]
-    another = held.beside_board or first.rival.unknown or first.pattern == "one"
-    return held.evidence - LEVEL if another else 0.0
 
 
 def odd_view(solution: Solution) -> str | None:

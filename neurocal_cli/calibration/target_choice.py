@@ -39,12 +39,7 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_intrinsics
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
-from neurocal_cli.calibration.other_causes import (
-    contest_of,
-    has_other_cause,
-    lens_is_too_simple,
-    other_causes,
-)
+from neurocal_cli.calibration.other_causes import contest_of, contradicts_sigma, has_other_cause
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
 from neurocal_cli.calibration.verdict.effects import bends
@@ -79,7 +74,7 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     if found is None:
         return None
     doubtful = named and known is None and choice == "auto"
-    return None if doubtful and lens_is_too_simple(fits, found) else found.target
+    return None if doubtful and has_other_cause(fits, found, named) else found.target
 
 
 def _common_survey(cameras: Sequence[Calibration]) -> Target | None:
@@ -219,8 +214,10 @@ def _searched(
         return solution, rejected
     common = _found(solution, choice, None)
     found = common if choice == "flat" else _with_bends(solution, common)
-    if found is not None and choice == "auto" and has_other_cause(solution, found):
-        return solution, rejected
+    if found is not None and choice == "auto":
+        fit, named = (solution.problem, solution.adjusted), solution.has_named_lens
+        if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated.worth):
+            return solution, rejected
     kept = solution.noted(target_kept=choice == "auto")
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):
@@ -331,7 +328,8 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
     gain = gain_over_given(found, [given]) if common is None else found.evidence - common.evidence
-    return common if other_causes(solution, before, common is not None) > gain else found
+    held = contest_of(solution, before, common is not None)
+    return common if held is not None and held.instead_of_target() > gain else found
 
 
 def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:

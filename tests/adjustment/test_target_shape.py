@@ -28,7 +28,7 @@ from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, prob
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.other_causes import lens_is_too_simple
+from neurocal_cli.calibration.other_causes import has_other_cause
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import nearest_similarity, rotation_step
 from neurocal_cli.errors import DegenerateGeometryError
@@ -412,7 +412,7 @@ def test_some_of_many_views_tell_whether_a_model_is_too_simple(
     monkeypatch.setattr(find_module, "_DENSE", 60)
     found = find_target([fit])
     assert found is not None
-    assert lens_is_too_simple([fit], found) == too_simple
+    assert has_other_cause([fit], found, True) == too_simple
 
 
 def test_a_given_camera_with_distortion_finds_the_target_as_well() -> None:

@@ -41,6 +41,7 @@ _TRIED = 3  # rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
 _BESIDE = 0.3  # share of the evidence from which on a cause counts beside the target's shape
+_FAR_MORE = 2.0  # times the log evidence of an estimated target
 _EXPLAINS_MUCH = 0.3  # share of the squared error from which on a lens or a given value is fitted
 
 
@@ -62,11 +63,21 @@ class Contest:
         first = self.causes[0] if self.explained >= EXPLAINED else None
         return first is not None and first.pattern == "all" and not first.rival.of_board
 
-    @property
-    def beside_board(self) -> bool:
-        """Whether a known cause other than the shape of the target is a good part of the explanation."""
+    def instead_of_target(self, worth: float = 1.0) -> float:
+        """Log odds of causes other than the target's shape, known or not; 0 if there are none.
+
+        The level by which they have to beat the target's shape is taken off. An equation is `worth` so much
+        for that shape.
+        """
+        first = self.causes[0] if self.causes else None
+        if first is None:
+            return 0.0
         others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
-        return max(others, default=0.0) > _BESIDE * sum(one.evidence for one in self.causes)
+        told = sum(one.evidence for one in self.causes)
+        if max(others, default=0.0) > _BESIDE * told or first.rival.unknown or first.pattern == "one":
+            return worth * self.evidence - LEVEL
+        # A shape that is far more probable than the found one is not open: no print is stretched by percents.
+        return worth * told / _FAR_MORE if first.pattern == "all" else 0.0
 
 
 def contest(
