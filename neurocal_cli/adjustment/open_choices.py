@@ -1,8 +1,8 @@
 """Uncertainty of the camera from choices that the data leave open: distortion model and given target.
 
-A selected model may lack coefficients that the real lens has: p1 and p2 are correlated with the image centre,
-k3 with k1 and k2. Or it has them only because noise made them large. All these coefficients are called open
-here. Each group of them is either absent or has a Gaussian prior, whose width is three times or a third of
+A selected model may lack coefficients that the real lens has: p1 and p2, which no fisheye has, are correlated
+with the image centre, k3 with k1 and k2. Or it has them only because noise made them large. All these
+coefficients are called open here. Each group of them is either absent or has a Gaussian prior, whose width is three times or a third of
 the typical size in real lenses, the same factor for all groups (spike and slab, George and McCulloch 1993).
 To second order around the minimum, all these models follow from one normal matrix. Let w_m be the posterior
 probability of model m, P_m and o_m its posterior covariance and mean of the open coefficients o, o_r their
@@ -41,6 +41,7 @@ from neurocal_cli.adjustment.normal_equations import (
 )
 from neurocal_cli.adjustment.reprojection import stretched_blocks
 from neurocal_cli.adjustment.views import Views
+from neurocal_cli.camera.directions import DECENTRED
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -54,6 +55,7 @@ from neurocal_cli.observations.points import Correspondences
 # up to three times as large. Repeated by test_choice_uncertainty.py (slow: 200 draws).
 _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
+_DECENTRED = (*_FISHEYE, (("p1", "p2"), 1, 0.0015))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
 _ODDS = {1.0: 3.0}  # prior odds that a group of the typical size is present
@@ -137,22 +139,20 @@ def open_coefficients(
     farthest point, and `corner` the `corner_radius`.
     """
     own = coefficient_names(model)
-    richer = (
-        model if model == "fisheye" else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
-    )
+    wide = model == "fisheye"
+    richer = DECENTRED if wide else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
     names = coefficient_names(richer)
     if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
         return None
     value = dict(zip(own, k.tolist(), strict=True))
     estimated = {name for name, is_free in zip(own, free[5:].tolist(), strict=True) if is_free}
-    wide = richer == "fisheye"
     may_be_noise = () if wide else _NOISE_MAY_MAKE
     open_names = [name for name in names if name not in estimated or name in may_be_noise]
     if not open_names:
         return None
     far = max(float(np.arctan(reach)) if wide else reach, corner)
     size, groups = np.zeros(len(open_names)), []
-    for members, power, share in _FISHEYE if wide else _POLYNOMIAL:
+    for members, power, share in _DECENTRED if wide else _POLYNOMIAL:
         places = [open_names.index(name) for name in members if name in open_names]
         size[places] = share / far**power
         if places:

@@ -12,6 +12,7 @@ is applied. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
     eucm           (x', y') = (X, Y) / (alpha hypot(sqrt(beta) rho, Z) + (1 - alpha) Z)
                                                                   (Khomutenko, Garcia and Martinet 2016)
     rich           (x', y') = fisheye plus a smooth displacement: `rich_lens`
+    decentred      (x', y') = fisheye, then p1, p2 of `polynomial`
 
 omnidir (before its polynomial), double_sphere and eucm have the form (X, Y) / w. Their radius grows with
 theta where w > 0 and dw/dZ > 0, because w is homogeneous of degree one. Beyond that the model is not a valid
@@ -36,6 +37,10 @@ WIDE = {
     "eucm": ("alpha", "beta"),
     "rich": ("k1", "k2", "k3", "k4", *rich_lens.NAMES),
 }
+DECENTRED = "decentred"
+"""A fisheye with p1 and p2. It is no choice of users: it tells what a fisheye leaves open."""
+BY_DIRECTION = {**WIDE, DECENTRED: (*WIDE["fisheye"], "p1", "p2")}
+"""Coefficients of all models of this module."""
 # Models whose first coefficient is xi; the scale in the image centre is alpha_u / (1 + xi).
 WITH_XI = ("omnidir", "double_sphere")
 
@@ -66,7 +71,10 @@ def project_directions(
     if model == "fisheye":
         return _fisheye(k, X, Y, Z, q)
     if model == "omnidir":
-        return _omnidir(k, X, Y, Z, q)
+        return _distorted(_by_divisor(X, Y, *_unified(k[0], q, Z)), k[1:])
+    if model == DECENTRED:
+        found = _distorted(_fisheye(k[:4], X, Y, Z, q), (0.0, 0.0, k[4], k[5]))
+        return found._replace(by_coefficient=[*found.by_coefficient[:4], *found.by_coefficient[6:]])
     if model == "rich":
         return _rich(k, X, Y, Z, q, by_coefficients)
     sphere = _double_sphere if model == "double_sphere" else _eucm
@@ -141,9 +149,9 @@ def _eucm(k: Coefficients, q: Array, Z: Array) -> _Divisor:
     return w, alpha * beta / d, alpha * Z / d + (1 - alpha), [d - Z, alpha * q / (2 * d)]
 
 
-def _omnidir(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Direction:
-    m = _by_divisor(X, Y, *_unified(k[0], q, Z))
-    (x, y), (xx, xy, yx, yy), by_k = distorted_with_jacobian(k[1:], m.x, m.y)
+def _distorted(m: Direction, k: Coefficients) -> Direction:
+    """Image points to which the distortion `polynomial` with the coefficients k is applied."""
+    (x, y), (xx, xy, yx, yy), by_k = distorted_with_jacobian(k, m.x, m.y)
 
     def after(dx: Array, dy: Array) -> tuple[Array, Array]:
         return xx * dx + xy * dy, yx * dx + yy * dy
@@ -152,7 +160,7 @@ def _omnidir(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Directi
     seen = m.seen & np.asarray((xx * yy > xy * yx) & (xx + yy > 0))
     return Direction(
         x, y, (by[0][0], by[1][0], by[2][0]), (by[0][1], by[1][1], by[2][1]),
-        [after(*m.by_coefficient[0]), *by_k], seen,
+        [*(after(*one) for one in m.by_coefficient), *by_k], seen,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from neurocal_cli.camera.directions import WIDE, project_directions
+from neurocal_cli.camera.directions import BY_DIRECTION, DECENTRED, WIDE, project_directions
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
@@ -59,6 +59,8 @@ _PINHOLES = {
 
 def coefficient_names(model: str) -> tuple[str, ...]:
     """Names of a model's coefficients, in order; an InputError for an unknown model."""
+    if model == DECENTRED:
+        return BY_DIRECTION[model]
     if model not in MODELS:
         raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(MODELS)}")
     return MODELS[model]
@@ -101,7 +103,7 @@ class Distortion:
     @property
     def wide(self) -> bool:
         """Whether the model projects directions of 90 degrees and more from the axis."""
-        return self.model in WIDE
+        return self.model in BY_DIRECTION
 
 
 def pinhole_coefficients(model: str) -> Array:
@@ -114,7 +116,7 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
 
     Each coefficient is a number or an array that broadcasts against x.
     """
-    if model in WIDE:
+    if model in BY_DIRECTION:
         seen = project_directions(model, k, x, y, np.ones_like(x), by_coefficients=False)
         return seen.x, seen.y
     return distorted(k, x, y)
@@ -122,7 +124,7 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
 
 def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Distorted:
     """The same with derivatives, as `Distorted`."""
-    if model in WIDE:
+    if model in BY_DIRECTION:
         seen = project_directions(model, k, x, y, np.ones_like(x))
         return (seen.x, seen.y), (*seen.by_x[:2], *seen.by_y[:2]), seen.by_coefficient
     return distorted_with_jacobian(k, x, y)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.directions import WIDE, project_directions
+from neurocal_cli.camera.directions import BY_DIRECTION, project_directions
 from neurocal_cli.camera.distortion import Distortion, distort, distort_with_jacobian
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import undistort
@@ -77,7 +77,7 @@ def project_points(
 
     Points in front of the camera are visible; for a wide lens, points in the domain of its model.
     """
-    if model in WIDE:
+    if model in BY_DIRECTION:
         a, s, b, u0, v0 = entries
         x, y, _, _, _, seen = project_directions(model, k, X, Y, Z, by_coefficients=False)
         return a * x + s * y + u0, b * y + v0, seen
@@ -100,7 +100,7 @@ def project_with_jacobian(
     a, s, b, u0, v0 = entries
     X, Y, Z = points
     by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
-    if model in WIDE:
+    if model in BY_DIRECTION:
         x, y, by_x, by_y, by_k, seen = project_directions(model, k, X, Y, Z)
         by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = x, y, y
         _through_matrix(entries, list(zip(by_x, by_y, strict=True)), by_point)

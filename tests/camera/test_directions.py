@@ -11,7 +11,7 @@ from support.wide_cameras import plainly_projected
 
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.directions import WIDE, project_directions
+from neurocal_cli.camera.directions import BY_DIRECTION, DECENTRED, WIDE, project_directions
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import largest_angle, unproject_directions
@@ -91,11 +91,23 @@ def test_the_image_grows_up_to_the_largest_angle_and_no_farther(model: str, data
         assert not Camera(Intrinsics(1, 1, 0, 0), lens).sees(beyond)[0]
 
 
-@every_wide_model
+def test_a_decentred_fisheye_has_the_tangential_terms_after_its_polynomial() -> None:
+    k = [0.02, -0.01, 0.004, -0.001, 0.002, -0.003]
+    rays = directions(np.linspace(0.1, 1.8, 20), np.linspace(0, 6, 20))
+    x, y = (bent := project_directions("fisheye", k[:4], *rays.T)).x, bent.y
+    r2, found = x**2 + y**2, project_directions(DECENTRED, k, *rays.T)
+    np.testing.assert_allclose(found.x, x + 2 * k[4] * x * y + k[5] * (r2 + 2 * x**2), rtol=1e-12)
+    np.testing.assert_allclose(found.y, y + k[4] * (r2 + 2 * y**2) + 2 * k[5] * x * y, rtol=1e-12)
+
+
+@pytest.mark.parametrize("model", list(BY_DIRECTION))
 def test_derivatives_behind_the_camera_too(model: str) -> None:
-    k = {"fisheye": [0.02, -0.01, 0.002, 0], "omnidir": [1.1, -0.1, 0.02, 1e-3, 2e-3]}.get(
-        model, [-0.2, 0.6] if model == "double_sphere" else [0.6, 1.1]
-    )
+    k = {
+        "fisheye": [0.02, -0.01, 0.002, 0],
+        DECENTRED: [0.02, -0.01, 0.002, 0, 1e-3, 2e-3],
+        "omnidir": [1.1, -0.1, 0.02, 1e-3, 2e-3],
+        "double_sphere": [-0.2, 0.6],
+    }.get(model, [0.6, 1.1])
     if model == "rich":
         k = [0.02, -0.01, 0.002, 0, 1.2, 1.1, 0.9]
         k = np.append(k, np.random.default_rng(3).normal(0, 0.003, len(rich_lens.NODES)))
