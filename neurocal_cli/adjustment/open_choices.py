@@ -2,8 +2,9 @@
 
 A selected model may lack coefficients that the real lens has: p1 and p2, which no fisheye has, are correlated
 with the image centre, k3 with k1 and k2. Or it has them only because noise made them large. All these
-coefficients are called open here. Each group of them is either absent or has a Gaussian prior, whose width is three times or a third of
-the typical size in real lenses, the same factor for all groups (spike and slab, George and McCulloch 1993).
+coefficients are called open here. Each group of them is either absent or has a Gaussian prior, whose width is
+three times or a third of the typical size in real lenses, the same factor for all groups (spike and slab,
+George and McCulloch 1993).
 To second order around the minimum, all these models follow from one normal matrix. Let w_m be the posterior
 probability of model m, P_m and o_m its posterior covariance and mean of the open coefficients o, o_r their
 reported values (0 if they were left out), and T = dc/do the response of the camera parameters c. Then
