@@ -239,7 +239,7 @@ def _refined(found: Solution, axes: tuple[int, int]) -> float:
     told = estimates(lin, lin.spare, (rival,))
     if not told or lin.board is None:
         return 1.0
-    longer = 1.0 + float(told[0].amounts[0])
+    longer = float(np.exp(told[0].amounts[0]))  # positive beyond the linear range, too
     return longer if lin.board.axes[axes[0], 0] else 1.0 / longer
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.distorted import through
+from support.distorted import SIGMA, bent_set, through
 from support.scenes import random_flat_set
 from support.slow_cases import slow_but
 from support.wrong_inputs import (
@@ -157,3 +157,9 @@ def test_boards_that_fit_no_camera_end_in_a_message(seed: int) -> None:
     """Their target is estimated from a camera that fits nothing; some ended in an error of arithmetic."""
     points = scaled(turned(seed, (0.5, 1.0, np.pi)[seed % 3]), [(0.5, 1 / 25.4)[seed % 2], 1, 1], ALL)
     assert first_reason(points).startswith("the points fit a board")
+
+
+def test_a_lens_far_from_k1k2_leaves_no_negative_proportions() -> None:
+    scene, _ = bent_set("fisheye", 35)
+    points = scene.points(SIGMA, np.random.default_rng([35, 1]))
+    assert proportions(points) is None
