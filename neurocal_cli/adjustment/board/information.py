@@ -156,11 +156,6 @@ class Information:
         cameras = replace(self.cameras, own=other.cameras.own[which], cross=other.cameras.cross[which])
         return replace(self, cameras=cameras, pose_point=other.pose_point[which])
 
-    def of_cameras(self, kept: NDArray[np.bool_]) -> Information:
-        """The quadratic in some parameters (f,) of the cameras, where the others are held."""
-        by_camera = self.by_camera[:, :, np.append(kept, True)]
-        return replace(self, cameras=self.cameras.only(np.flatnonzero(kept)), by_camera=by_camera)
-
     def pose_by(self, offsets: Array) -> Array:
         """(P, p) contribution of offsets (n, 3) to the right side of the poses."""
         P, p = self.pose_point.shape[:2]

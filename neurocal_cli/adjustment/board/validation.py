@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,6 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    joined,
     joined_without_each,
     of_views,
     without_points,
@@ -163,38 +163,30 @@ def passes_cross_validation(
         return True
     parts = [part.info for part in without]
     folds = np.arange(len(parts))
-    # A camera with fewer views than folds is missing in some folds.
-    seen = [np.diagonal(part.cameras.shared)[:-1] > 0 for part in parts]
-    by_parts = all(some.all() for some in seen)
     try:
-        if by_parts:
-            estimated = [found for _, found in without_each(without, prior, sizes, variance)]
-        else:
-            others = [_seen(rest) for rest in joined_without_each(parts)]
-            estimated = [minimum_of(some, prior, sizes, variance)[1] for some in others]
+        estimated = [found for _, found in without_each(without, prior, sizes, variance)]
     except np.linalg.LinAlgError:
         return True
     tried = np.stack([np.zeros((len(parts[0].point), 3)), *estimated])
     # Costs minimised over cameras and poses: without offsets, and with those from all but each fold.
-    if by_parts:
-        terms = [np.stack(term) for term in zip(*(some.at(tried) for some in without), strict=True)]
-        sums = [term.sum(axis=0) for term in terms]
-        whole = _least(*sums)
-        out = _least(*terms)
-        rest = _least(*(total - term for total, term in zip(sums, terms, strict=True)))
-    else:
-        whole = _least(*WithoutPoses(joined(parts)).at(tried))
-        out = np.stack([_least(*WithoutPoses(_seen(part)).at(tried)) for part in parts])
-        rest = np.stack([_least(*WithoutPoses(other).at(tried)) for other in others])
+    terms = [np.stack(term) for term in zip(*(some.at(tried) for some in without), strict=True)]
+    sums = [term.sum(axis=0) for term in terms]
+    whole, out = _least(*sums), _least(*terms)
+    rest = _least(*(total - term for total, term in zip(sums, terms, strict=True)))
     own = out[folds, 1 + folds], rest[folds, 1 + folds]
     alone = (own[0] - out[:, 0]).sum()
     together = (whole[1:] - own[1] + rest[:, 0]).sum() - len(parts) * whole[0]
     return bool(alone < 0 or together < 0)
 
 
-def _seen(info: Information) -> Information:
-    """Information without the cameras that have no views."""
-    return info.of_cameras(np.diagonal(info.cameras.shared)[:-1] > 0)
+def _held(matrix: Array, f: int) -> Array:
+    """A bordered matrix in which those of the f parameters that no view tells stay as they are.
+
+    A camera with fewer views than folds is missing in some of them.
+    """
+    held, untold = matrix.copy(), np.flatnonzero(np.diagonal(matrix)[:f] == 0)
+    held[untold, untold] = 1.0
+    return held
 
 
 def _least(S: Array, g: Array, cost: Array) -> Array:
@@ -211,16 +203,19 @@ def without_each(
     `variance` [px^2] is that of the noise. Raises `numpy.linalg.LinAlgError` if the other parts do not
     determine the cameras.
     """
-    if points_first(sum(part.info.cameras.cross[..., -1].size for part in parts), prior):
-        others = joined_without_each([part.info for part in parts])
-        return [minimum_of(some, prior, sizes, variance) for some in others]
-    matrices = [part.matrix for part in parts]
     f = len(parts[0].info.cameras.shared) - 1
+    if points_first(sum(part.info.cameras.cross[..., -1].size for part in parts), prior):
+        estimated = []
+        for some in joined_without_each([part.info for part in parts]):
+            cameras = replace(some.cameras, shared=_held(some.cameras.shared, f))
+            estimated.append(minimum_of(replace(some, cameras=cameras), prior, sizes, variance))
+        return estimated
+    matrices = [part.matrix for part in parts]
     whole = sum_of(matrices)
     whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
     estimated = []
     for out in matrices:
-        M = whole - out
+        M = _held(whole - out, f)
         x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
         estimated.append((x[:f], x[f:].reshape(-1, 3)))
     return estimated

@@ -19,10 +19,10 @@ from typing import cast
 
 import numpy as np
 
-from neurocal_cli.adjustment.board.information import labelled, point_terms
+from neurocal_cli.adjustment.board.information import Sight, information_of
 from neurocal_cli.adjustment.board.posterior import prior_covariance
 from neurocal_cli.adjustment.board.prior import prior_of_target
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.calibration.calibrate import Lens, calibrate
 from neurocal_cli.calibration.target_choice import common_target
 from neurocal_cli.calibration.zoom.settings import LensPoints, PixelData, Tables
@@ -71,38 +71,29 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
     The data have the points at their estimated coordinates, and the tables the poses of all views. The
     variance [px^2] is that of the noise.
     """
-    views, K = data.views, len(data.names) - 4
+    views, prior, n = data.views, prior_of_target(target), len(target.given)
     label = target.rows_of(views.world)
-    prior = prior_of_target(target)
-    n = len(target.given)
     state = data.state_of(tables.local, tables.constants)
     jacobian = data.camera_jacobian(tables.local, tables.constants)
-    columns = camera_columns(K)
+    f = jacobian.shape[1]
     information = np.zeros((3 * n, 3 * n))
     coupling = np.zeros((data.lens.n_settings, len(data.names) + data.n_shared, 3 * n))
-    for v in range(views.n_views):
-        one = views.subset(np.array([v]))
-        camera = state.of_view(v)
-        own = labelled(one, label[views.first[v] : views.first[v] + views.counts[v]])
-        terms = point_terms(one.batches, camera, one.scale, own, columns, n)
-        N = terms.normal[0]
-        by_pose = terms.pose_point[0].reshape(6, 3 * n)
-        gain = np.linalg.solve(N[POSE, POSE], by_pose)
-        information += _block_diagonal(terms.point) - by_pose.T @ gain
-        entries = (
-            terms.by_camera[..., :-1].reshape(3 * n, -1).T
-            - N[columns[:, None], np.arange(POSE.start, POSE.stop)] @ gain
-        )
-        coupling[data.setting[v]] += jacobian[v].T @ entries
+    for s in range(data.lens.n_settings):
+        which = np.flatnonzero(data.setting == s)
+        camera = replace(state.of_view(int(which[0])), R=state.R[which], t=state.t[which])
+        own = label[np.isin(views.index, which)]
+        sight = Sight(views.subset(which), camera, np.ones(f, dtype=bool), True, own)
+        left = WithoutPoses(information_of([sight], n)).matrix
+        information += left[f:-1, f:-1]
+        coupling[s] = jacobian[which[0]].T @ left[:f, f:-1]
     if not data.free_theta:
         coupling[:, -1] = 0.0
-    px2 = views.pixel_scale**2
     turn = _block_diagonal(prior.axes)
     spread = turn @ prior_covariance(prior, target.sizes) @ turn.T
     root = np.linalg.cholesky(spread)
-    inner = np.eye(3 * n) + root.T @ (px2 / variance * information) @ root
+    inner = np.eye(3 * n) + root.T @ (information / variance) @ root
     root = root @ np.linalg.inv(np.linalg.cholesky(inner)).T
-    flat = px2 * coupling.reshape(-1, 3 * n) @ root
+    flat = coupling.reshape(-1, 3 * n) @ root
     U, values, _ = np.linalg.svd(flat, full_matrices=False)
     kept = (values > _NOTHING * values[0])[:_MOST]
     return np.asarray((U * values)[:, : int(kept.sum())].reshape(*coupling.shape[:2], -1))
