@@ -52,6 +52,17 @@ class Quadratics:
     g: Array  # (G, f)
     cost: Array  # (G,)
 
+    @classmethod
+    def of(cls, blocks: Array) -> Quadratics:
+        """From matrices (G, f + 1, f + 1) of the unknowns and, the last ones, the residuals."""
+        return cls(blocks[..., :-1, :-1], blocks[..., :-1, -1], blocks[..., -1, -1])
+
+    @property
+    def blocks(self) -> Array:
+        """(G, f + 1, f + 1) S bordered by g and the cost."""
+        g = self.g[..., None]
+        return np.block([[self.S, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
+
     @quietly
     def at(self, step: Array) -> Array:
         """(G,) error of each group after a step (f,), or a step of its own (G, f)."""
@@ -164,7 +175,7 @@ def _eliminated(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> tup
         left, solved = eliminate(normal, kept, POSE_COLUMNS, RIDGE)
     else:
         left, solved = normal[..., kept[:, None], kept], np.zeros((*normal.shape[:-2], 6, len(kept)))
-    return Quadratics(left[..., :-1, :-1], left[..., :-1, -1], left[..., -1, -1]), solved
+    return Quadratics.of(left), solved
 
 
 @frozen_dataclass(eq=False)
@@ -241,7 +252,7 @@ def held_out_points(m: Minimum, penalty: _Penalty | None = None) -> Array:
     step = np.zeros((*normal.shape[:2], normal.shape[-1] - 1))
     step[..., m.columns] = camera
     step[..., POSE] = solved[..., -1] - (solved[..., :-1] @ camera[:, :, None])[..., 0]
-    return Quadratics(normal[..., :-1, :-1], normal[..., :-1, -1], normal[..., -1, -1]).at(step).reshape(-1)
+    return Quadratics.of(normal).at(step).reshape(-1)
 
 
 def _wedges(views: Views) -> NDArray[np.intp]:

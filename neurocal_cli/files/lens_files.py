@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli import __version__
+from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.calibration.zoom.fit import LensCameras
 from neurocal_cli.calibration.zoom.mlfn import Topology
 from neurocal_cli.calibration.zoom.parameter_networks import SCALES, LensNets, ParameterNet
-from neurocal_cli.calibration.zoom.settings import CONTROLS, Constants, LensPoints, Normal, Tables, describe
+from neurocal_cli.calibration.zoom.settings import CONTROLS, Constants, LensPoints, Tables, describe
 from neurocal_cli.calibration.zoom.zoom_lens import Member, RejectedSetting, ZoomLens
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion, coefficient_names
@@ -118,7 +119,7 @@ _NET = Keys(
 _TABLE = Keys(
     "constants: constants, local: nxn, H: nxn, g: nxn, cost: n",
     {"constants": _CONSTANTS},
-    H=lambda table: _upper(table.normal.H),
+    H=lambda table: _upper(table.normal.S),
     g=lambda table: table.normal.g,
     cost=lambda table: table.normal.cost,
 )
@@ -242,7 +243,7 @@ def _table(field: Field, S: int, L: int, Q: int) -> Tables:
     H = np.zeros((S, size, size))
     H[:, upper[0], upper[1]] = found["H"]
     H[:, upper[1], upper[0]] = found["H"]
-    return Tables(found["local"], found["constants"], Normal(H, found["g"], found["cost"], True))
+    return Tables(found["local"], found["constants"], Quadratics(H, found["g"], found["cost"]))
 
 
 _FILES = "camera"

@@ -197,7 +197,7 @@ def _baseline_error(
         # A table of known cameras may contain t_z, which the poses replace.
         intrinsic = np.column_stack([local[:, :4], coefficients_of(local, lens.model)])
         data = PixelData(points, False, lens.model, True)
-        _, constants = data.linearise(intrinsic, replace(fitted, theta=constants.theta))
+        constants = data.linearise(intrinsic, replace(fitted, theta=constants.theta)).constants
     return _rms(_squares(lens, points, local, constants))
 
 
@@ -239,7 +239,7 @@ def _polynomial(table: Tables, variance: float, scale: str, x: Array, powers: Ar
     """Each parameter alone, weighted by the variances of the static calibrations."""
     outputs, by_local = local_to_outputs(scale, table.local)
     L = outputs.shape[1]
-    covariance = inverse(table.normal.H[:, :L, :L])
+    covariance = inverse(table.normal.S[:, :L, :L])
     spread = variance * np.einsum("sij,sjk,sik->si", by_local, covariance, by_local)
     Phi = monomials(x, powers)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
@@ -256,7 +256,7 @@ def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Ba
     table = lens.tables
     outputs, _ = local_to_outputs(scale, table.local)
     start = np.asarray(np.linalg.lstsq(monomials(x, powers), outputs, rcond=None)[0], dtype=float)
-    constants = np.zeros(table.normal.H.shape[1] - outputs.shape[1])
+    constants = np.zeros(table.normal.S.shape[1] - outputs.shape[1])
     error = QuadraticError(x, table.local, table.normal, lens.variance)
     found, shared, _ = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
     moved = table.constants.moved(shared)

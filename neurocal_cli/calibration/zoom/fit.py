@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.calibration.zoom.initialisation import (
     CalibratedSettings,
     FitOptions,
@@ -44,7 +45,6 @@ from neurocal_cli.calibration.zoom.settings import (
     CONTROLS,
     Constants,
     LensPoints,
-    Normal,
     Tables,
     local_names,
     scaled_controls,
@@ -195,7 +195,7 @@ def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:
         x,
         start.data.names,
         start.tables.local,
-        start.tables.normal.H,
+        start.tables.normal.S,
         start.variance,
         rng,
         options.budget,
@@ -346,9 +346,9 @@ def fit_lens_cameras(
     return lens
 
 
-def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Normal:
+def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Quadratics:
     """Inverse covariances of the given parameters, from the size of their errors."""
     outputs, by_local = local_to_outputs(members[0].scale, local)
     H = np.swapaxes(by_local, 1, 2) @ (by_local / error_variances(members, x, outputs)[..., None])
     S, L = local.shape
-    return Normal(symmetric(H), np.zeros((S, L)), np.zeros(S), True)
+    return Quadratics(symmetric(H), np.zeros((S, L)), np.zeros(S))

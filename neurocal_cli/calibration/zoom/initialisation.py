@@ -17,6 +17,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
 from neurocal_cli.calibration.calibrate import Lens, calibrate
@@ -26,7 +27,6 @@ from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committ
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
     LensPoints,
-    Normal,
     PixelData,
     Tables,
     describe,
@@ -171,13 +171,14 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
     squares = 0.0
     for part in (inside, ~inside):
         rng, names, local = np.random.default_rng(options.seed), start.data.names, start.tables.local
-        H = start.tables.normal.H[part]
+        H = start.tables.normal.S[part]
         members = fit_committee(
             x[part], names, local[part], H, start.variance, rng, _QUICK_BUDGET, lambda share: None
         )
         predicted = np.mean([nets.local(x) for nets in members], axis=0)
-        there, _ = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
-        squares += float(there.cost[~part].sum()) if np.isfinite(there.cost).all() else np.inf
+        there = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
+        cost = there.normal.cost
+        squares += float(cost[~part].sum()) if np.isfinite(cost).all() else np.inf
     return float(np.sqrt(squares / len(start.lens.points)))
 
 
@@ -187,7 +188,7 @@ def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> Cal
     start = CalibratedSettings.of(data, calibrate_each(data, options.seed, options.report), options.report)
     while True:
         normal = start.tables.normal
-        if not normal.sensible or not np.isfinite(normal.cost).all():
+        if not start.tables.sensible or not np.isfinite(normal.cost).all():
             raise DegenerateGeometryError(
                 f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
                 "moved, give several views of the board at each setting, and --camera moving"
@@ -221,7 +222,7 @@ def free_pose_variance(start: CalibratedSettings) -> float:
     t_z = start.data.names.index("t_z")
     static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
     free = CalibratedSettings.of(replace(start.data, still=False), static)
-    sensible = free.tables.normal.sensible and np.isfinite(free.variance)
+    sensible = free.tables.sensible and np.isfinite(free.variance)
     return free.variance if sensible else np.nan
 
 
@@ -307,22 +308,17 @@ def common_tables(
         if progress is not None:
             progress("common constants", (done := next(tried)) / (done + 10))
         constants = before.constants if fixed else before.constants.moved(by_shared)
-        tables = _linearised(data, before.local + by_local, constants)
-        return tables, tables.normal.sensible
+        tables = data.linearise(before.local + by_local, constants)
+        return tables, tables.sensible
 
-    L, start = local.shape[1], _linearised(data, local, constants)
+    L, start = local.shape[1], data.linearise(local, constants)
     shared = np.arange(L, L + (0 if fixed else data.n_shared))
     problem = SharedAndOwn(start, lambda at: Arrowhead.of(at.normal.blocks, shared, np.arange(L)), moved)
     settled = minimise(problem, _OPTIONS).settled[0]
     return replace(problem.state, converged=bool(settled))
 
 
-def _linearised(data: PixelData, local: Array, constants: Constants) -> Tables:
-    normal, constants = data.linearise(local, constants)
-    return Tables(local, constants, normal)
-
-
-def local_covariance(normal: Normal, L: int, variance: float) -> Array:
+def local_covariance(normal: Quadratics, L: int, variance: float) -> Array:
     """Covariance of each setting's local parameters (S, L, L)."""
-    found = Arrowhead.of(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
-    return variance * found.covariance().own
+    found = Arrowhead.of(normal.blocks, np.arange(L, normal.S.shape[1]), np.arange(L))
+    return found.covariance(variance).own

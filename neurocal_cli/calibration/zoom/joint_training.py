@@ -139,8 +139,9 @@ class JointLearner:
     def linearise(self) -> float:
         """Recompute the normal matrices at the present networks; 2 E."""
         reference = self.nets.local(self.x)
-        normal, self.constants = self.data.linearise(reference, self.constants)
-        normal = with_scatter(normal, self.scatter, self.variance)
+        there = self.data.linearise(reference, self.constants)
+        self.constants = there.constants
+        normal = with_scatter(there.normal, self.scatter, self.variance)
         self.error = QuadraticError(self.x, reference, normal, self.variance)
         self.shared = np.zeros(self.data.n_shared)
         return self.error.cost(self.nets, self.shared)
@@ -200,7 +201,7 @@ def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> 
     _, by_output = outputs_to_local(nets.scale, np.column_stack([net.output(learner.x) for net in nets.nets]))
     # On the scales of the networks' outputs: gradients, second derivatives, and the step.
     gradient = (np.swapaxes(by_output, 1, 2) @ pull[:, :L, None])[..., 0] / learner.variance
-    curvature = np.einsum("sia,sij,sja->sa", by_output, normal.H[:, :L, :L], by_output) / learner.variance
+    curvature = np.einsum("sia,sij,sja->sa", by_output, normal.S[:, :L, :L], by_output) / learner.variance
     step = rate * gradient / np.maximum(curvature, 1e-300)
     trained = []
     for j, net in enumerate(nets.nets):
@@ -209,7 +210,7 @@ def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> 
         A = (J.T * weight) @ J + np.diag(net.prior)
         rhs = J.T @ (weight * step[:, j]) - net.prior * net.weights
         trained.append(replace(net, weights=net.weights + solve_scaled(A, rhs[:, None], ROUNDING)[:, 0]))
-    total = normal.H[:, L:, L:].sum(axis=0)
+    total = normal.S[:, L:, L:].sum(axis=0)
     constants = rate * solve_scaled(total, pull[:, L:].sum(axis=0)[:, None], ROUNDING)[:, 0]
     return replace(nets, nets=tuple(trained)), shared + constants
 
@@ -270,8 +271,8 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     local = each.mean(axis=0)
     constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
-    there, _ = start.data.linearise(local, constants)
-    rmse = np.sqrt(there.cost / start.data.counts)
+    there = start.data.linearise(local, constants)
+    rmse = np.sqrt(there.normal.cost / start.data.counts)
     # The linearisation fails for a member now and then, so the median counts.
     squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
@@ -326,11 +327,11 @@ def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Arr
     local, J = joint.nets.local_with_jacobian(start.controls)
     _, L, P = J.shape
     normal = tables.normal
-    H = normal.H[:, :L, :L]
+    H = normal.S[:, :L, :L]
     spread = J @ joint.covariance[:P, :P] @ np.swapaxes(J, 1, 2)
     # The constants of the networks differ from those of the tables; the effect is small.
     error = local - tables.local
-    K = spread @ with_scatter(normal, scatter, variance).H[:, :L, :L] / variance
+    K = spread @ with_scatter(normal, scatter, variance).S[:, :L, :L] / variance
     remain = np.eye(L) - K
     out = np.asarray(np.linalg.solve(remain, error[..., None]), dtype=np.float64)
     spread_out = np.linalg.solve(remain, spread)
@@ -338,7 +339,7 @@ def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Arr
     expected = np.asarray(spread_out + own)
     normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
-    counts = np.maximum(normal.H[:, 2, 2], 1.0)  # the derivative by u0 is 1, so this is the number of points
+    counts = np.maximum(normal.S[:, 2, 2], 1.0)  # the derivative by u0 is 1, so this is the number of points
     return np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(normalised, 0.0)
 
 
@@ -358,11 +359,11 @@ def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str
     except InputError:  # no valid camera there, because another setting is wrong
         return None
     L = len(lens.names)
-    H = tables.normal.H[s, :L, :L]
+    H = tables.normal.S[s, :L, :L]
     error = prediction.local[0] - tables.local[s]
     own = lens.variance * np.linalg.pinv(H, hermitian=True)
     sigmas = float(np.sqrt(error @ np.linalg.solve(prediction.covariance[0, :L, :L] + own, error) / L))
-    pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.H[s, 2, 2], 1.0)))
+    pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.S[s, 2, 2], 1.0)))
     if sigmas < _SIGMAS or pixels < _LEAST_ERROR * lens.noise_floor_px:
         return None
     return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import (
     ROUNDING,
@@ -184,27 +185,6 @@ class Constants:
         return Constants(theta, orthonormalised(rotation_step(step[1:4]) @ self.R), self.t + step[4:6])
 
 
-@frozen_dataclass(eq=False)
-class Normal:
-    """Second-order model of the reprojection error of each setting."""
-
-    H: Array  # (S, L + Q, L + Q) over the local parameters, then the shared ones
-    g: Array  # (S, L + Q) J^T r with r = observed - predicted
-    cost: Array  # (S,) sum of squared residuals [px^2]
-    sensible: bool  # whether all points are in front of the camera, where the distortion is monotonic
-
-    @classmethod
-    def of(cls, blocks: Array, sensible: bool) -> Normal:
-        """From `blocks`."""
-        return cls(blocks[:, :-1, :-1], blocks[:, :-1, -1], blocks[:, -1, -1], sensible)
-
-    @property
-    def blocks(self) -> Array:
-        """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
-        g = self.g[..., None]
-        return np.block([[self.H, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
-
-
 def symmetric(H: Array) -> Array:
     """Matrices (S, n, n) of the upper halves of others: exactly symmetric, like those read from a file."""
     return np.asarray(np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2))
@@ -216,7 +196,10 @@ class Tables:
 
     local: Array  # (S, L)
     constants: Constants
-    normal: Normal  # linearised there; for known cameras: of the squared errors over the networks' scatter
+    # The error of each setting [px^2] around them, over the L local parameters, then the Q shared ones. Of
+    # known cameras: the squared errors over the networks' scatter.
+    normal: Quadratics
+    sensible: bool = True  # whether all points are in front of the camera, where the distortion is monotonic
     converged: bool = True
 
 
@@ -264,7 +247,7 @@ class PixelData:
         """(S,) points of each setting."""
         return np.bincount(self.lens.point_setting, minlength=self.lens.n_settings)
 
-    def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
+    def linearise(self, local: Array, constants: Constants) -> Tables:
         """Linearise the reprojection error at local parameters (S, L) and constants.
 
         The constants come back with the best poses where each view has its own.
@@ -285,7 +268,7 @@ class PixelData:
             summed[:, theta, theta] = 1.0
         summed = symmetric(summed)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
-        return Normal.of(summed, good), constants
+        return Tables(local, constants, Quadratics.of(summed), good)
 
     def state_of(self, local: Array, constants: Constants) -> CameraState:
         """Normalised cameras of all views."""
@@ -364,19 +347,18 @@ class QuadraticError:
 
     x: Array  # (S, D) scaled controls of the settings
     reference: Array  # (S, L) local parameters at which the normal matrices were computed
-    normal: Normal
+    normal: Quadratics
     variance: float  # of the noise of one coordinate [px^2]
 
     def offset(self, local: Array, shared: Array) -> tuple[Array, Array]:
         """Differences from the reference (S, L + Q), and H times these."""
         d = np.column_stack([local - self.reference, np.broadcast_to(shared, (len(local), len(shared)))])
-        return d, (self.normal.H @ d[..., None])[..., 0]
+        return d, (self.normal.S @ d[..., None])[..., 0]
 
     def cost(self, model: LocalModel, shared: Array) -> float:
         """2 E after a step `shared` (Q,) of the constants."""
-        d, Hd = self.offset(model.local(self.x), shared)
-        fit = self.normal.cost.sum() + ((Hd - 2 * self.normal.g) * d).sum()
-        return float(fit / self.variance + (model.prior * model.weights**2).sum())
+        d, _ = self.offset(model.local(self.x), shared)
+        return float(self.normal.at(d).sum() / self.variance + (model.prior * model.weights**2).sum())
 
     def system(self, model: LocalModel, shared: Array) -> tuple[Array, Array]:
         """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
@@ -386,7 +368,7 @@ class QuadraticError:
         rhs = np.empty(P + pull.shape[1] - L)
         rhs[:P] = J.reshape(-1, P).T @ pull[:, :L].ravel() - prior * model.weights
         rhs[P:] = pull[:, L:].sum(axis=0)
-        return gauss_newton(J, self.normal.H / self.variance, prior), rhs
+        return gauss_newton(J, self.normal.S / self.variance, prior), rhs
 
     def minimum(self, model: Model, shared: Array, options: DescentOptions) -> tuple[Model, Array, float]:
         """The model and the constants' step at the minimum, and 2 E there."""
@@ -426,7 +408,7 @@ def inverse(H: Array) -> Array:
     return solve_scaled(H, np.broadcast_to(np.eye(H.shape[-1]), H.shape), ROUNDING)
 
 
-def with_scatter(normal: Normal, scatter: Array, variance: float) -> Normal:
+def with_scatter(normal: Quadratics, scatter: Array, variance: float) -> Quadratics:
     """Normal matrices for local parameters that scatter from setting to setting.
 
     The local parameters of a setting are those of the model plus an offset of variance `scatter` (L,). The
@@ -436,4 +418,4 @@ def with_scatter(normal: Normal, scatter: Array, variance: float) -> Normal:
         return normal
     some, N = np.flatnonzero(scatter), normal.blocks
     B, cross = N[:, some[:, None], some] + variance * np.diag(1 / scatter[some]), N[:, some]
-    return Normal.of(N - np.swapaxes(cross, 1, 2) @ solve_scaled(B, cross, ROUNDING), normal.sensible)
+    return Quadratics.of(N - np.swapaxes(cross, 1, 2) @ solve_scaled(B, cross, ROUNDING))

@@ -147,7 +147,7 @@ class ZoomLens(Summarised):
     def posteriors(self) -> tuple[Array, ...]:
         """Covariance of each member's weights and constants."""
         x = self.scaled(self.settings)
-        H = with_scatter(self.tables.normal, self.scatter, self.variance).H / self.variance
+        H = with_scatter(self.tables.normal, self.scatter, self.variance).S / self.variance
         found = []
         for member in self.members:
             _, J = member.nets.local_with_jacobian(x)
@@ -230,7 +230,7 @@ class ZoomLens(Summarised):
                 "choose a setting in the calibrated range"
             )
         constants, offsets = _mean_constants([member.constants for member in self.members], self.still)
-        Q = self.tables.normal.H.shape[1] - len(self.names)
+        Q = self.tables.normal.S.shape[1] - len(self.names)
         within = np.mean([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0)
         offsets = offsets[:, :Q]
         both = np.concatenate([locals_, np.broadcast_to(offsets[:, None], (*locals_.shape[:2], Q))], axis=2)

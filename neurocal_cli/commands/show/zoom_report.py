@@ -79,7 +79,7 @@ def lens_words(lens: ZoomLens) -> tuple[str, list[str]]:
 
 def _camera_errors(lens: ZoomLens) -> str:
     """The median std of the given parameters; that of alpha is relative."""
-    std = np.sqrt(np.diagonal(np.linalg.inv(lens.tables.normal.H), axis1=1, axis2=2))
+    std = np.sqrt(np.diagonal(np.linalg.inv(lens.tables.normal.S), axis1=1, axis2=2))
     share = 100 * float(np.median(std[:, 0] / lens.tables.local[:, 0]))
     others = [f"{name} {value:.3g}" for name, value in zip(lens.names, np.median(std, axis=0), strict=True)]
     return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])

@@ -512,7 +512,7 @@ def one_at_a_time(lens: ZoomLens, x: np.ndarray) -> np.ndarray:
     table, rng = lens.static, np.random.default_rng(0)
     settings = lens.scaled(lens.settings)
     members = fit_committee(
-        settings, lens.names, table.local, table.normal.H, lens.variance, rng, Budget(), lambda share: None
+        settings, lens.names, table.local, table.normal.S, lens.variance, rng, Budget(), lambda share: None
     )
     return np.mean([nets.local(x) for nets in members], axis=0)
 

@@ -229,17 +229,18 @@ def begun(lens: LensPoints, data: PixelData) -> tuple[Array, Constants]:
 def test_the_gradient_of_the_pixel_error_is_its_derivative(case: str) -> None:
     lens, data = moving() if case == "moving" else still(case == "bends")
     local, constants = begun(lens, data)
-    normal, constants = data.linearise(local, constants)
+    tables = data.linearise(local, constants)
+    normal, constants = tables.normal, tables.constants
     for j in range(local.shape[1]):
         step = np.zeros_like(local)
         step[:, j] = 1e-5 * np.abs(local[:, j]).max()
-        there, back = (data.linearise(local + sign * step, constants)[0].cost for sign in (1, -1))
+        there, back = (data.linearise(local + sign * step, constants).normal.cost for sign in (1, -1))
         slope = (there - back) / (2 * step[0, j])
         np.testing.assert_allclose(-2 * normal.g[:, j], slope, rtol=2e-4, atol=2e-4 * np.abs(slope).max())
     for q in range(data.n_shared):
         step = np.zeros(data.n_shared)
         step[q] = 1e-6 if q < 4 else 1e-3
-        there, back = (data.linearise(local, constants.moved(sign * step))[0].cost for sign in (1, -1))
+        there, back = (data.linearise(local, constants.moved(sign * step)).normal.cost for sign in (1, -1))
         slope = (there - back) / (2 * step[q])
         found = -2 * normal.g[:, local.shape[1] + q]
         np.testing.assert_allclose(found, slope, rtol=2e-4, atol=3e-4 * np.abs(slope).max())
@@ -285,19 +286,19 @@ def test_the_joint_step_goes_down_the_derivative_of_the_joint_error(scale: str) 
 def test_scatter_enters_the_normal_matrices_as_an_offset_that_is_fitted() -> None:
     lens, data = still()
     local, constants = begun(lens, data)
-    normal, _ = data.linearise(local, constants)
+    normal = data.linearise(local, constants).normal
     scatter = np.array([4.0, 0.0, 1.0, 0.0, 9.0])
     loose = with_scatter(normal, scatter, 0.02)
     some = np.flatnonzero(scatter)
     d = np.random.default_rng(8).normal(size=11) * 1e-3
     # By hand: the offset that makes the sum of both errors least.
-    H, g = normal.H[0], normal.g[0]
+    H, g = normal.S[0], normal.g[0]
     B = H[np.ix_(some, some)] + 0.02 * np.diag(1 / scatter[some])
     offset = np.linalg.solve(B, (g - H @ d)[some])
     whole = d.copy()
     whole[some] += offset
     by_hand = normal.cost[0] - 2 * g @ whole + whole @ H @ whole + 0.02 * (offset**2 / scatter[some]).sum()
-    found = loose.cost[0] - 2 * loose.g[0] @ d + d @ loose.H[0] @ d
+    found = loose.cost[0] - 2 * loose.g[0] @ d + d @ loose.S[0] @ d
     assert found == pytest.approx(by_hand, rel=1e-9)
 
 
@@ -323,7 +324,7 @@ def test_alternating_ends_where_joint_training_ends() -> None:
     x = scaled_controls(lens.settings, lens.settings.min(axis=0), lens.settings.max(axis=0))
     budget = Budget(topologies=((1, 1),), starts=4, best=2, members=1, schedule=Schedule(150, 30, 80))
     rng = np.random.default_rng(0)
-    H = tables.normal.H
+    H = tables.normal.S
     nets, *_ = fit_committee(x, data.names, tables.local, H, 0.0225, rng, budget, lambda share: None)
     arguments = (data, x, nets, tables.constants, 0.0225, np.zeros(5))
     together, turns = (
