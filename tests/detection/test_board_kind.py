@@ -177,7 +177,17 @@ def test_squares_in_a_grid_are_no_circles(side: int) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [("dice", 20), ("lamps", 3), ("bottles", 4), ("pieces", 33), ("pieces", 205), ("polygons", 13)],
+    [
+        ("dice", 20),
+        ("lamps", 3),
+        ("lamps", 229),
+        ("bottles", 4),
+        ("pieces", 33),
+        ("pieces", 205),
+        ("polygons", 13),
+        ("targets", 142),
+        ("discs", 145),
+    ],
 )
 def test_things_in_rows_are_no_circles(kind: str, seed: int) -> None:
     assert seen_circles(no_boards.picture(kind, seed)) is None

@@ -298,6 +298,32 @@ def _polygons(rng: np.random.Generator) -> Canvas:
     return _rows(rng, (pitch, pitch), one, ground)
 
 
+def _targets(rng: np.random.Generator) -> Canvas:
+    """Targets of several rings, one in the other."""
+    side = int(rng.integers(30, 90)) * _FINE // 2
+    ground, level = _levels(rng)
+    bands = 2 * int(rng.integers(2, 5)) - 1
+
+    def one(canvas: Canvas, x: int, y: int) -> None:
+        for k in range(bands):
+            radius = round(0.42 * side * (1 - k / bands))
+            cv2.circle(canvas, (x, y), radius, (ground if k % 2 else level,), -1, cv2.LINE_AA)
+
+    return _rows(rng, (side, side), one, ground)
+
+
+def _discs(rng: np.random.Generator) -> Canvas:
+    """Discs of one colour and of any size."""
+    side = int(rng.integers(24, 60)) * _FINE // 2
+    ground, level = _levels(rng)
+
+    def one(canvas: Canvas, x: int, y: int) -> None:
+        radius = round(rng.uniform(0.2, 0.42) * side)
+        cv2.circle(canvas, (x, y), radius, (level,), -1, cv2.LINE_AA)
+
+    return _rows(rng, (side, side), one, ground)
+
+
 _DRAW: dict[str, Callable[[np.random.Generator], Canvas]] = {
     "dice": _dice,
     "dominoes": _dominoes,
@@ -313,5 +339,7 @@ _DRAW: dict[str, Callable[[np.random.Generator], Canvas]] = {
     "pieces": _pieces,
     "crosswords": _crossword,
     "polygons": _polygons,
+    "targets": _targets,
+    "discs": _discs,
 }
 KINDS = tuple(_DRAW)

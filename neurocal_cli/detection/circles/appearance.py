@@ -2,7 +2,10 @@
 
 Pips of dice, keys, lamps, pieces of a game and bottles in a crate stand in rows, too. But a die has an
 outline and a compartment a wall, so the light changes between the marks; signs are in keys; lamps may be off;
-and other marks are long or have corners. The light around all marks is averaged in the coordinates of the
+other marks are long or have corners. Ink reflects the same share of the paper's light at all places; all
+circles of a board have one radius; and from its middle outwards, the light of a disc or a ring has the steps
+of one blurred edge or two, where that of a ball, of a coin or of a target has others.
+The light around all marks is averaged in the coordinates of the
 board, in which circles are circles whatever the tilt. So noise and things before the board matter little.
 """
 
@@ -12,15 +15,18 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import Image, interpolate
+from neurocal_cli.detection.fitting.edge_profile import erf_and_density
 from neurocal_cli.detection.markers.lattice import flattening_of, predicted
 
 _RAYS = 16
 _FIRST, _STEP = 0.3, 0.05  # of the radius, from where on the light is looked at on rings
 _INSIDE, _AROUND = 2, 1.5  # the ring of 0.4, within all marks, and the radius up to which a mark ends
-_NEIGHBOURS = 1.5  # distances to the next mark, within which marks are around one
 _NEXT = 0.54  # of the distance to the next mark, of the last ring
 _BLUR = 2.2  # standard deviations of the blur from the edge to where the paper is blank
 _SHARP = 0.15  # of the radius: of an edge less blurred, a small displacement is a large change of light
+_BLURS = 0.7, 0.85, 1.0, 1.2  # of that by the steepest place, which samples on rings do not meet
+_NEAR = 4.0  # standard deviations of the blur, within which a sharpened edge overshoots
+_HOLE = 0.5  # least step of the light at the edge of a hole, over that at the other edge
 _SURE = 4.0  # standard deviations of the noise
 _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second row is shifted
 
@@ -28,10 +34,18 @@ _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second r
 # circles of 9 px and more, blurred by up to half of their radius; the second number is for circles that are
 # described, which may be smaller, blurred by a hand as far as they are wide, or holes of rings.
 _OFF = 0.05, 0.1  # of the distance to the next mark: from where those around a mark predict it (0.014)
-_UNEVEN = 0.035, 0.25  # of the log of the contrast from that around, of a third (0.015; photographs 0.03)
+_INKS = 0.04, 0.25  # rms, of the share of the paper's light from a smooth change (0.02; photographs 0.034)
+_SIZES = 0.05, 0.2  # rms, of the log of the radius from a smooth change (0.01)
+_MIXED = (
+    0.02,
+    0.1,
+)  # rms, of the light by the distance from that of a disc or a ring (0.008; photographs 0.027)
 _LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
 _CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
-_SIGNED = 0.09, 0.09  # spread of the light within most marks beyond that around them (0.05; keys 0.12)
+_SIGNED = (
+    0.09,
+    0.09,
+)  # spread of the light within most marks beyond that around them (0.02, rings 0.08; keys 0.12)
 _LABELLED = 1 / 8  # of the marks, beside which there may be ink
 _RULED = 0.015, 0.08  # change of the light in the paper between the marks (0.006; gaps between dice 0.025)
 
@@ -63,10 +77,20 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     outer = middle + int(np.abs(profile[middle : edge + 1] - profile[inner]).argmax())
     ring = np.median(levels, axis=2)
     contrast = ring[:, outer] - ring[:, inner]
-    amount = np.log(np.maximum(np.abs(contrast), 1.0))
-    next_to = (away > 0) & (away < _NEIGHBOURS * apart)
-    # A shadow's edge changes those of the marks that it passes.
-    uneven = float(np.quantile(np.abs(amount - next_to @ amount / next_to.sum(axis=1)), 1 / 3))
+    x, y = (places - places.mean(axis=0)).T / max(float(np.ptp(places)), 1.0)
+    smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+    def odd(values: Array) -> float:
+        """What marks differ by (rms) from a smooth change over the board."""
+        change = smooth @ np.linalg.lstsq(smooth, values, rcond=None)[0]
+        return float(np.sqrt(((values - change) ** 2).mean()))
+
+    # Ink reflects the same share of the paper's light everywhere, in the shade as well.
+    mark, paper = np.maximum(ring[:, inner], 0.0), np.maximum(ring[:, outer], 0.0)
+    if profile[inner] > profile[outer]:
+        mark, paper = paper, mark
+    ink = mark / np.maximum(paper, 1.0)
+    inks = odd(ink) / max(1 - float(np.median(ink)), 0.1)
     levels -= ring[:, inner, None, None]
     levels /= np.where(np.abs(contrast) < 1, 1.0, contrast)[:, None, None]
     mean = levels.mean(axis=0)
@@ -75,21 +99,56 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
         return False
     half = int(darker[-1])
     long, *corners = (np.abs(np.fft.rfft(mean[half])) / _RAYS)[2 : _RAYS // 2].tolist()
-    inside, around = (float(np.median(levels[:, k].std(axis=1))) for k in (_INSIDE, edge))
-    signed = np.sqrt(max(inside**2 - around**2, 0.0))
+    across = levels[:, inner : outer + 1].mean(axis=2)
+    beyond = np.maximum((across > 0.5).argmax(axis=1), 1)
+    before, after = (across[np.arange(len(across)), k] for k in (beyond - 1, beyond))
+    back = np.clip((after - 0.5) / np.maximum(after - before, 0.1), 0, 1)
+    sizes = odd(np.log(shares[inner + beyond] - _STEP * back))
+    within, around = (float(np.median(levels[:, k].std(axis=1))) for k in (_INSIDE, edge))
+    signed = np.sqrt(max(within**2 - around**2, 0.0))
     step = abs(profile[outer] - profile[inner])
     blur = _STEP * radius * step / max(np.sqrt(2 * np.pi) * np.abs(np.diff(profile)).max(), 1e-9)
     # The light is half-way between this ring and the next one.
-    level, after = mean[[half, min(half + 1, len(mean) - 1)]].mean(axis=1)
-    between = (0.5 - level) / max(after - level, 0.5 - level, 1e-9)
+    level, next_level = mean[[half, min(half + 1, len(mean) - 1)]].mean(axis=1)
+    between = (0.5 - level) / max(next_level - level, 0.5 - level, 1e-9)
     blank = rings[half] + between * _STEP * radius + _BLUR * blur
-    paper = (rings > blank) & (rings < apart - blank)
-    at = places[:, None, None] + shift[paper]
-    within = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
+    clear = (rings > blank) & (rings < apart - blank)
+    at = places[:, None, None] + shift[clear]
+    inside = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
     cornered = max(corners) * min(1.0, blur / (_SHARP * radius))
-    found = uneven, long, cornered, signed, _ruled(levels[:, paper], within)
-    limits = _UNEVEN, _LONG, _CORNERED, _SIGNED, _RULED
+    near = rings < 0.5 * apart
+    mixed = _misfit(mean[near].mean(axis=1), shares[near])
+    found = inks, sizes, mixed, long, cornered, signed, _ruled(levels[:, clear], inside)
+    limits = _INKS, _SIZES, _MIXED, _LONG, _CORNERED, _SIGNED, _RULED
     return all(one <= most[described] for one, most in zip(found, limits, strict=True))
+
+
+def _misfit(light: Array, at: Array) -> float:
+    """Departure (rms) of the light at distances (n,) from that of one blurred edge, or of two of a ring."""
+    slope, between = np.diff(light), 0.5 * (at[1:] + at[:-1])
+    steepest = max(float(np.abs(slope).max()), 1e-9)
+    blur = max(float(np.ptp(light)), 1e-9) * (at[1] - at[0]) / (np.sqrt(2 * np.pi) * steepest)
+    edges = sorted((slope, -slope), key=lambda one: -float(one.max()))
+    places = [_peak(between, one) for one in edges]
+    # The hole of a ring shows the paper, unless blur hides it; and a sharpened edge overshoots.
+    least = 0.0 if min(abs(places[0] - places[1]), *places) < _NEAR * blur else _HOLE
+    best = np.inf
+    for share in _BLURS:
+        steps = [erf_and_density((at - place) / (share * blur))[0] for place in places]
+        for some in (steps[:1], steps):
+            columns = np.stack([np.ones_like(at), *some], axis=-1)
+            known = np.linalg.lstsq(columns, light, rcond=None)[0]
+            if len(some) == 1 or known[1] * known[2] < -least * known[1] ** 2:
+                best = min(best, float(np.sqrt(((light - columns @ known) ** 2).mean())))
+    return best
+
+
+def _peak(at: Array, values: Array) -> float:
+    """Place of the greatest value, by a parabola through it and its neighbours."""
+    k = int(np.clip(values.argmax(), 1, len(values) - 2))
+    before, here, after = values[k - 1 : k + 2]
+    bend = max(2 * here - before - after, 1e-9)
+    return float(at[k] + np.clip(0.5 * (after - before) / bend, -1, 1) * (at[1] - at[0]))
 
 
 def _ruled(levels: Array, within: Array) -> float:
