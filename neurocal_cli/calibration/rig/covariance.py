@@ -31,7 +31,7 @@ from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
-from neurocal_cli.adjustment.normal_equations import ROUNDING, Covariance, solve_scaled
+from neurocal_cli.adjustment.normal_equations import Covariance, eliminate, solve_scaled
 from neurocal_cli.adjustment.open_choices import (
     OpenCoefficients,
     OpenPrior,
@@ -47,8 +47,6 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
-_ROUNDS = 20  # in which the moves without a frame converge, if it has less than 3/4 of the information
-_MOST_UNKNOWNS = 80  # with which the matrices of the frames are formed instead
 _LEAST_FRAMES = 3  # fewest for a jackknife; with two, the covariance is multiplied by the scatter
 
 
@@ -68,43 +66,38 @@ def contradicting_covariance(fit: RigFit) -> Array:
 def covariance_over_frames(fit: RigFit) -> Array:
     """(f, f) covariance of the free shared unknowns by the delete-one jackknife over the frames.
 
-    The move without frame k solves (S - S_k) x = -g_k with the frame's own part of the normal equations. Of
-    many unknowns the matrices S_k are never formed: x = S^-1 (S_k x - g_k) is repeated.
+    Without frame k the unknowns move by x with (S - S_k) x = -g_k, where S_k and g_k are the frame's own part
+    of the normal equations. They are 0 but in the columns of the cameras that saw the frame, so only these
+    are solved for: with G = S^-1, x = G (S_k x - g_k).
     """
     problem, free = fit.problem, np.flatnonzero(fit.free)
     views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
-    reduced, solved = fit.normal.reduced()
-    S = reduced[np.ix_(free, free)]
-    inverse = solve_scaled(S, np.eye(len(free)))
-    n, cross = len(fit.free), fit.normal.cross[:, :, :-1]
-
-    def of_frames(x: Array) -> Array:
-        """S_k x_k, or with the residual's column the right sides, of frames (V, n + 1)."""
-        out = -np.einsum("vps,vp->vs", cross, (solved @ x[..., None])[..., 0])
-        for one in views:
-            m = len(one.place)
-            part = one.M[:, :m, :m] @ x[one.frame[:, None], one.place][..., None]
-            out[one.frame[:, None], one.place[:-1]] += part[:, :-1, 0]
-        return out[:, free]
-
-    whole = np.zeros((len(cross), n + 1))
-    # At the minimum, to which one step leads if the cameras were not refined.
-    whole[:, free], whole[:, -1] = -inverse @ reduced[free, -1], 1.0
-    scores = of_frames(whole)
-    scores -= scores.mean(axis=0)  # their sum is 0 up to rounding
-    f = len(free)
-    if f <= _MOST_UNKNOWNS:
-        parts = np.empty((len(cross), f, f))
-        for k, column in enumerate(free):
-            whole[:] = 0.0
-            whole[:, column] = 1.0
-            parts[:, :, k] = of_frames(whole)
-        moves = solve_scaled(S - parts, -scores[..., None], ROUNDING)[..., 0]
-    else:
-        moves = -scores @ inverse
-        for _ in range(_ROUNDS):
-            whole[:, free], whole[:, -1] = moves, 0.0
-            moves = (of_frames(whole) - scores) @ inverse
+    reduced, _ = fit.normal.reduced()
+    inverse = solve_scaled(reduced[np.ix_(free, free)], np.eye(len(free)))
+    step = inverse @ reduced[free, -1]  # to the minimum, if the cameras were not refined
+    # Of each column among the free ones; the residual comes after them.
+    number = np.full(len(fit.free) + 1, -1)  # of each column among the free ones and, the last, the residual
+    number[free], number[-1] = np.arange(len(free)), len(free)
+    of_frames: list[list[tuple[NDArray[np.intp], Array]]] = [[] for _ in problem.scale]
+    for one in views:
+        for frame, M in zip(one.frame.tolist(), one.M, strict=True):
+            of_frames[frame].append((number[one.place], M))
+    moves = np.empty((len(of_frames), len(free)))
+    for k, parts in enumerate(of_frames):
+        seen = np.zeros(len(free) + 1, dtype=bool)
+        for place, _ in parts:
+            seen[place[place >= 0]] = True
+        m, local = int(seen.sum()), np.cumsum(seen) - 1
+        N = np.zeros((m + 6, m + 6))
+        for place, M in parts:
+            kept = np.append(place >= 0, np.ones(6, dtype=bool))
+            at = np.append(local[place[place >= 0]], m + np.arange(6))
+            N[np.ix_(at, at)] += M[np.ix_(kept, kept)]
+        left, _ = eliminate(N, np.arange(m), m + np.arange(6))
+        columns, S = np.flatnonzero(seen[:-1]), left[:-1, :-1]
+        g, G = left[:-1, -1] - S @ step[columns], inverse[:, columns]
+        x = solve_scaled(np.eye(m - 1) - G[columns] @ S, -(G[columns] @ g)[:, None])[:, 0]
+        moves[k] = G @ (S @ x - g)
     return jackknife(moves[np.isfinite(moves).all(axis=1)])
 
 
