@@ -382,7 +382,7 @@ def test_the_covariance_of_a_pair_is_that_of_differences() -> None:
         rig.pair("cam2", "cam2")
 
 
-@pytest.mark.parametrize("n", [3, 10])
+@pytest.mark.parametrize("n", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_the_jackknife_over_frames_is_that_of_fits_without_each(n: int) -> None:
     problem, state = made(n, 8)
     fit = adjust_rig(problem, state, problem.estimated_shared)
