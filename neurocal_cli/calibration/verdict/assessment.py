@@ -41,7 +41,6 @@ from neurocal_cli.calibration.calibration import (
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
-    EXACT,
     SPARE,
     Finding,
     pixel_spread,
@@ -67,6 +66,8 @@ from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import scale_of
 
+# Of the pixels' spread, 0.01 px of 12 Mpx: a smaller error is that of rounded numbers, and has no cause.
+_ROUNDING = 1e-5
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
 _DISTANT = 10.0  # times the distance of the farthest point
@@ -274,7 +275,7 @@ class _AtMinimum:
             yield from stated_survey(target, self.calibration.rmse_px, given_px)
 
     def _is_exact(self) -> bool:
-        return self.calibration.rmse_px < EXACT * pixel_spread(self.points)
+        return self.calibration.rmse_px < _ROUNDING * pixel_spread(self.points)
 
     @cached_property
     def networks(self) -> Array:
@@ -314,19 +315,22 @@ class _AtMinimum:
         """The causes of the residuals."""
         if self._is_exact():
             return None
-        return self._with_outliers() or self._contest_at(self.views, self.state)
+        return self._with_outliers(self._contest_at(self.views, self.state))
 
-    def _with_outliers(self) -> Contest | None:
+    def _with_outliers(self, kept: Contest | None) -> Contest | None:
         """The same with the outliers, if a cause that all views share explains most of their error."""
         if self.calibration.rejected.points is None or self.calibration.target is not None:
-            return None
+            return kept
         points = with_rejected(self.calibration)
         points = points.select(np.isin(points.view_names, self.points.view_names)[points.view_index])
         views = arrange(points)
         start = normalised(self.calibration.state(points.view_names), views)
         state = adjust(views.batches, start, self.free, self.free_poses, _STEPS).state
         held = self._contest_at(views, state)
-        return replace(held, of_outliers=True) if held is not None and held.of_all_views else None
+        if held is None or not held.of_all_views:
+            return kept
+        remains = kept is not None and any(one.rival is held.causes[0].rival for one in kept.causes)
+        return replace(held, of_outliers=True, remains=remains)
 
     def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
         target = self.calibration.target

@@ -55,6 +55,7 @@ class Contest:
     explained: float  # share of the squared error that all of them explain
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
     of_outliers: bool = False  # whether the first one explains the outliers, which are included
+    remains: bool = True  # whether the points that are no outliers show it as well
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
 
     @property
@@ -334,6 +335,8 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
             # The standard deviations do not include the board and the lens.
             grade = max(grade, int(not found.rival.of_given))
+        if contest.of_outliers and not place:
+            grade = max(grade, 1)  # points are left out because of it
         yield grade, reason + or_else(names), found.rival.advice
 
 
@@ -378,7 +381,7 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     if found.rival.of_given and told.moved_poses > _BIASED.poor:
         grade = max(grade, 1 + int(found.explained > EXPLAINED))
     # Outliers were left out of the calibration, and what differs from view to view is in the std.
-    if contest.of_outliers or not found.weights.size:
+    if not contest.remains or not found.weights.size:
         return grade, reason
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0

@@ -232,6 +232,18 @@ def test_a_cut_through_the_images_is_told_and_no_view_left_out() -> None:
     assert not found.rejected.views
 
 
+@pytest.mark.parametrize(("seed", "by"), [(742, [0.06, 0.04]), (740, [0.2, 0.1])])
+def test_a_cut_of_a_fraction_of_a_pixel_is_told_where_the_noise_is_far_smaller(
+    seed: int, by: list[float]
+) -> None:
+    points, _ = target_photographed("flat", seed, 12, sigma=0.004)
+    right = (points.pixels[:, 0] > 640)[:, None]
+    found = calibrate(displaced(points, np.where(right, by, 0.0)))
+    assert found.verdict is not None
+    assert found.verdict.reasons[0].startswith("the right half of the images is displaced by (")
+    assert bool(len(found.rejected)) == ("because of it" in reasons(found))
+
+
 def test_a_video_codec_is_told() -> None:
     points, _ = target_photographed("flat", 741, 14, sigma=0.1)
     phase = 2 * np.pi * (points.pixels + 0.5) / 16
