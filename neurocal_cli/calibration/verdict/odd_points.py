@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.findings import FEW_POINTS, Finding, Limit, name_some
+from neurocal_cli.calibration.verdict.findings import FEW_POINTS, TOLD, Finding, Limit, name_some
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.observations.points import Correspondences
 
@@ -191,14 +191,14 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     if points.n_views < 2:
         return
     worlds = worlds_by_view(points)
-    step = _steps(worlds)
+    step, error = _steps(worlds).T
     # The spacing that most views have; of equally common ones, that in the middle, the first of two.
     log = np.log(step)
     alike = (np.abs(log[:, None] - log[None]) < np.log(_SCALED)).sum(axis=1)
     common = np.flatnonzero(alike == alike.max())
     middle = common[np.abs(log[common] - median(log)).round(6).argmin()]
     ratios = log - log[middle]
-    off = np.abs(ratios) > np.log(_SCALED)
+    off = np.abs(ratios) > np.log(_SCALED) + TOLD * np.hypot(error, error[middle])
     if not off.any():
         return
     off &= ~_seen_in_others(worlds, off)
@@ -232,8 +232,11 @@ def worlds_by_view(points: Correspondences) -> list[Array]:
 
 
 def _steps(worlds: list[Array]) -> Array:
-    """(V,) median distance of a point's nearest neighbour; computed once for equal points."""
-    known: dict[bytes, float] = {}
+    """(V, 2) median distance of a point's nearest neighbour, and its relative error; once for equal points.
+
+    The error is 0 on a grid. Of scattered points, another choice has another median.
+    """
+    known: dict[bytes, tuple[float, float]] = {}
     found = []
     for world in worlds:
         world = world[:_MOST_POINTS]
@@ -241,7 +244,11 @@ def _steps(worlds: list[Array]) -> Array:
         if key not in known:
             squares = ((world[:, None] - world[None]) ** 2).sum(axis=-1)
             squares[squares == 0] = np.inf
-            known[key] = float(median(np.sqrt(squares.min(axis=1))))
+            nearest = np.sort(np.sqrt(squares.min(axis=1)))
+            middle, quarter = float(median(nearest)), len(nearest) // 4
+            with np.errstate(invalid="ignore"):  # of a single point
+                between = float(nearest[-1 - quarter] - nearest[quarter]) / middle
+            known[key] = middle, between / float(np.sqrt(len(nearest)))
         found.append(known[key])
     return np.array(found)
 

@@ -36,6 +36,17 @@ def test_a_view_with_few_of_the_points_is_in_no_other_unit() -> None:
     assert list(views_of_another_scale(some)) == []
 
 
+def test_a_view_of_some_scattered_points_is_in_no_other_unit() -> None:
+    """A drone sees surveyed points of the ground; those of one view lie closer together by chance."""
+    rng = np.random.default_rng(3)
+    worlds = [np.append(rng.uniform(0, 100, (60, 2)), rng.normal(0, 1, (60, 1)), axis=1) for _ in range(40)]
+    names = np.repeat([f"v{k:02d}" for k in range(40)], 60)
+    points = Correspondences(np.concatenate(worlds), rng.uniform(0, 4000, (2400, 2)), names)
+    assert list(views_of_another_scale(points)) == []
+    (finding,) = views_of_another_scale(scaled(points, [1 / 25.4] * 3, [3]))
+    assert "v03: the points lie" in finding[1]
+
+
 @pytest.mark.parametrize(
     ("pixels", "said"),
     [
