@@ -221,6 +221,10 @@ class Covariance:
         """(V, s, p) covariance between the shared unknowns and each block's own."""
         return np.asarray(self.shared @ np.swapaxes(self.follow, 1, 2))
 
+    def with_own(self, own: Array) -> Covariance:
+        """The same with another covariance of the own unknowns (V, p, p) at the present shared ones."""
+        return replace(self, alone=self.alone + own - self.own)
+
     def extended(self, columns: Columns, added: Array, follow: Array) -> Covariance:
         """With m more shared unknowns after the others, and a covariance (k, k) added to these columns (k,).
 

@@ -99,7 +99,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     m, n = basis.minimum, basis.n_equations
     plain = seen.plain or covariance(m, n + seen.by_prior, basis.shared)
     if basis.poses is not None:
-        plain = replace(plain, alone=plain.alone + basis.poses - plain.own)
+        plain = plain.with_own(basis.poses)
     if seen.shared is not None:
         return CameraCovariance(basis, plain, plain)
     grown = np.inf  # a surveyed target absorbs no more than the stated errors of its points
@@ -139,8 +139,10 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     spread = choices.spread_of_open(m.arrow, variance, richer.prior)
     if spread is None:
         return known
-    left_out, f = richer.prior.left_out, len(known.plain.shared)
-    found, columns = choices.opened(known.found, np.arange(f), m.arrow, spread, left_out)
+    left_out, f, found = richer.prior.left_out, len(known.plain.shared), known.found
+    if seen.target is not None:  # it follows all of these coefficients, and so do the poses
+        found = replace(found, follow=m.arrow.follow[:, :, ~left_out]).with_own(found.own)
+    found, columns = choices.opened(found, np.arange(f), m.arrow, spread, left_out)
     wide = WideCovariance(richer, m.normal, found.shared[np.ix_(columns, columns)])
     return replace(known, found=found, wide=wide)
 
