@@ -145,12 +145,13 @@ class Arrowhead:
         cross[:, :, -1] += right
         return Arrowhead(shared, self.own, cross)
 
-    def reduced(self) -> tuple[Array, Array]:
+    def reduced(self, ridge: float = 0.0) -> tuple[Array, Array]:
         """The own unknowns eliminated: the Schur complement (s + 1, s + 1), and their response (V, p, s + 1).
 
         The response to the shared unknowns has the opposite sign; in the residual's column it is their step.
+        `ridge` is as for `solve_scaled`.
         """
-        solved = solve_scaled(self.own, self.cross)
+        solved = solve_scaled(self.own, self.cross, ridge)
         s = len(self.shared)
         return self.shared - self.cross.reshape(-1, s).T @ solved.reshape(-1, s), solved
 

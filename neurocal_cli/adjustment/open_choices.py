@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.board.prior import LEAN, STRETCH
-from neurocal_cli.adjustment.cross_validation import Minimum, inverse_or_nan, quietly, solve_or_nan
+from neurocal_cli.adjustment.cross_validation import RIDGE, Minimum, inverse_or_nan, quietly, solve_or_nan
 from neurocal_cli.adjustment.normal_equations import (
     Arrowhead,
     Columns,
@@ -195,7 +195,7 @@ def spread_of_open(arrow: Arrowhead, variance: float, prior: OpenPrior) -> Sprea
     The normal equations are those of all free unknowns at the reported values, the residual being observed
     minus predicted. `variance` is that of the residuals, enlarged if they are correlated.
     """
-    reduced, _ = arrow.reduced()
+    reduced, _ = arrow.reduced(RIDGE)
     S, g = reduced[:-1, :-1], reduced[:-1, -1]
     c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
     T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
@@ -319,7 +319,7 @@ def spread_of_stretch(arrow: Arrowhead, variance: float) -> SpreadOfOpen | None:
     The normal equations are those of the free parameters and, the last ones, the stretches. The variance is
     that of the residuals.
     """
-    reduced, _ = arrow.reduced()
+    reduced, _ = arrow.reduced(RIDGE)
     S, g = reduced[:-1, :-1], reduced[:-1, -1]
     is_open = np.arange(len(g)) >= len(g) - 2
     groups = (np.array([0]), np.array([1]))
