@@ -118,6 +118,13 @@ class Target:
         heights = surface_of(self.given).offsets(self.found) @ self.bends.coefficients.T  # (n, 3, V)
         return float(np.sqrt((heights**2).sum(axis=1).mean()))
 
+    def moved_from(self, other: Target) -> float:
+        """Distance of its points from an earlier estimate, rms in that one's std; inf for other points."""
+        if not np.array_equal(self.given, other.given):
+            return np.inf
+        move = (self.found - other.found) / np.maximum(other.std, 1e-300)
+        return float(np.sqrt((move**2).mean()))
+
     def joined(self, other: Target) -> Target:
         """Merge two separately estimated targets: the mean for points of both."""
         place = self.places(other.given)

@@ -83,9 +83,9 @@ def with_board(fit: RigFit, target: Target, adjusted: Callable[[RigProblem, RigS
         moved = _moved(target, fit)
         if moved is None:
             return fit
-        move = np.abs(moved.found - target.found) / np.maximum(target.std, 1e-300)
+        move = moved.moved_from(target)
         fit, target = _on_target(fit, target, moved, adjusted), moved
-        if np.sqrt((move**2).mean()) < _SETTLED:
+        if move < _SETTLED:
             return fit
     return fit
 

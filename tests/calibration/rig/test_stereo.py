@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +15,15 @@ from support.rigs import KINDS, RigScene, all_residuals, corner, random_rig, sid
 from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
-from neurocal_cli import StereoRig, calibrate
+from neurocal_cli import Correspondences, StereoRig, calibrate
+from neurocal_cli.calibration.rig import calibrate_rig
 from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
+from neurocal_cli.observations.target import Target
 
 
 def flat(kind: str = "verging", n_views: int = 8, seed: int = 5, lens: str = "none") -> RigScene:
@@ -277,3 +280,24 @@ def test_exchanging_the_cameras_inverts_the_rig() -> None:
     assert pytest.approx(one.R.T, abs=1e-6) == two.R
     assert two.t == pytest.approx(-one.R.T @ one.t, abs=0.01 * one.std["baseline"])
     assert two.rmse_px == pytest.approx(one.rmse_px, rel=1e-6)
+
+
+@pytest.mark.parametrize(("step", "calibrated"), [(0.1, 4), (0.5, 6)])
+def test_cameras_are_calibrated_anew_only_on_a_target_that_moved(
+    step: float, calibrated: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at, std, plane = np.zeros((4, 3)), np.ones((4, 3)), np.zeros(4, dtype=np.intp)
+    found = iter(Target(at, at + k * step, std, plane, {}, False, 1.0) for k in (1, 2))
+    models = iter(["k1"] * 2 + ["k1k2"] * 4)
+    done: list[object] = []
+
+    def one(points: Correspondences, **options: object) -> SimpleNamespace:
+        done.append(options["target"])
+        return SimpleNamespace(distortion_model=next(models), target=None, lens_choice={}, would_take=())
+
+    monkeypatch.setattr(calibrate_rig, "calibrate", one)
+    monkeypatch.setattr(calibrate_rig, "common_target", lambda cameras, choice: next(found))
+    left, right = sides(flat(n_views=3), 0.2)
+    own = {"target": "free"}
+    calibrate_rig.cameras_on_one_target({"left": left, "right": right}, {"left": own, "right": own}, None)
+    assert len(done) == calibrated
