@@ -68,34 +68,24 @@ def find_blobs(grey: NDArray[np.uint8]) -> Iterator[tuple[bool, Blobs]]:
         look = scaled.pop()
         scale = 2 ** len(scaled)
         for light, every in enumerate(found):
-            new = [np.zeros((0, 3))]
-            for v, u in parts:
-                part = np.ascontiguousarray(look[v, u])
-                ellipses = _all_ellipses(255 - part if light else part, max(look.shape))
-                new.append((ellipses + np.array([0.0, u.start, v.start])) * [scale**2, scale, scale])
-            every.insert(0, np.concatenate(new))
+            every.insert(0, _all_ellipses(255 - look if light else look, parts) * [scale**2, scale, scale])
             yield bool(light), _distinct(every)
         parts = dense_parts(Level(grey_levels(look), 2), _NEIGHBOURS) if scaled else []
 
 
-def _all_ellipses(grey: NDArray[np.uint8], longest: int) -> Array:
-    """Areas and centres (N, 3) of dark ellipses, some of them several times, in an image or a part of one.
-
-    `longest` is the longer side of the image.
-    """
+def _all_ellipses(grey: NDArray[np.uint8], parts: list[tuple[slice, slice]]) -> Array:
+    """Areas and centres (N, 3) of dark ellipses in parts of an image, some of them several times."""
     smooth = cv2.GaussianBlur(grey, (3, 3), 0)
-    found: list[Array] = []
-    for share in _WINDOWS:
-        window = 2 * round(0.5 * share * longest) + 3
-        mean = cv2.blur(smooth, (window, window))
-        for step in _STEPS:
-            found.append(dark_ellipses(smooth, np.maximum(mean, step) - np.uint8(step)))
-    return np.concatenate(found)
-
-
-def _is_compact(outline: Any) -> bool:
-    """Whether an outline encloses as much as that of a thin ellipse; the others are long, and many."""
-    return cv2.contourArea(outline) + len(outline) / 2 >= _COMPACT * len(outline) ** 2
+    outlines: list[NDArray[Any]] = []
+    for v, u in parts:
+        part = np.ascontiguousarray(smooth[v, u])
+        for share in _WINDOWS:
+            window = 2 * round(0.5 * share * max(grey.shape)) + 3
+            mean = cv2.blur(part, (window, window))
+            for step in _STEPS:
+                level = np.maximum(mean, step) - np.uint8(step)
+                outlines += _outlines(part < level, (u.start, v.start))
+    return _ellipses(outlines, smooth)
 
 
 def _distinct(looks: list[Array]) -> Blobs:
@@ -114,14 +104,29 @@ def _distinct(looks: list[Array]) -> Blobs:
     return Blobs(every[kept, 1:3], every[kept, 0])
 
 
-def dark_ellipses(image: NDArray[Any], level: NDArray[Any] | float) -> Array:
-    """Areas and centres (N, 3) of the parts of an image below a level that are ellipses.
+def dark_ellipses(image: NDArray[np.uint8], level: float) -> Array:
+    """Areas and centres (N, 3) of the parts of an image below a level that are ellipses."""
+    return _ellipses(_outlines(image < level), image)
 
-    They are darker than what is around them. The ellipses have the moments of what the outlines enclose.
+
+def _outlines(dark: NDArray[np.bool_], origin: tuple[int, int] = (0, 0)) -> list[NDArray[Any]]:
+    """Outlines (P, 2) of what may be ellipses in a mask, whose first pixel is at `origin`.
+
+    They enclose as much as that of a thin ellipse; the others are long, and many.
     """
-    dark = (image < level).view(np.uint8)
-    every, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    outlines = [np.asarray(x)[:, 0] for x in every if len(x) >= _SHORTEST and _is_compact(x)]
+    every, _ = cv2.findContours(dark.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=origin)
+    return [
+        np.asarray(x)[:, 0]
+        for x in every
+        if len(x) >= _SHORTEST and cv2.contourArea(x) + len(x) / 2 >= _COMPACT * len(x) ** 2
+    ]
+
+
+def _ellipses(outlines: list[NDArray[Any]], image: NDArray[np.uint8]) -> Array:
+    """Areas and centres (N, 3) of the outlines that are ellipses darker than what is around them.
+
+    The ellipses have the moments of what the outlines enclose.
+    """
     if not outlines:
         return np.zeros((0, 3))
     of, points = _joined(outlines)
