@@ -75,7 +75,7 @@ def find_blobs(grey: NDArray[np.uint8]) -> Iterator[tuple[bool, Blobs]]:
 
 def _all_ellipses(grey: NDArray[np.uint8], parts: list[tuple[slice, slice]]) -> Array:
     """Areas and centres (N, 3) of dark ellipses in parts of an image, some of them several times."""
-    smooth = cv2.GaussianBlur(grey, (3, 3), 0)
+    smooth = np.asarray(cv2.GaussianBlur(grey, (3, 3), 0), dtype=np.uint8)
     outlines: list[NDArray[Any]] = []
     for v, u in parts:
         part = np.ascontiguousarray(smooth[v, u])
