@@ -28,6 +28,7 @@ from neurocal_cli.calibration.zoom.joint_training import (
     contradiction,
     left_out_errors,
     most_suspect,
+    other_unit,
     provisional,
     refuse_gaps,
     take_turns,
@@ -182,8 +183,11 @@ def _without_odd(
         lens = provisional(rest, joints, options)
         reasons = [contradiction(lens, *one) for one in odd]
         if all(reasons):
+            unit, left = other_unit(start) or "", set(rest.lens.points.view_names)
+            out = tuple(name for name in start.lens.points.view_names if name not in left)
             for (setting, *_), reason in zip(odd, reasons, strict=True):
-                rest = rest.with_rejected(setting, reason or "")
+                said = f"{reason}; {unit}" if unit.startswith(out) else str(reason)
+                rest = rest.with_rejected(setting, said)
             return rest
     return None
 

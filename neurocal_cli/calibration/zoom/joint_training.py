@@ -261,8 +261,7 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     valid = are_cameras(each).all(axis=0)
     if not valid.all():
         where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
-        of_scale = views_of_another_scale(start.lens.points)
-        why = next((reason for _, reason, _ in of_scale), f"the networks give no camera at {where}")
+        why = other_unit(start) or f"the networks give no camera at {where}"
         raise DegenerateGeometryError(
             f"no lens fits all the settings: {why}; check the names, the unit of X,Y,Z and the image size of "
             "every setting"
@@ -279,6 +278,11 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     free_pose = float(np.sqrt(2 * free_pose_variance(start)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
     return replace(finished, warnings=_warnings(finished, start))
+
+
+def other_unit(start: CalibratedSettings) -> str | None:
+    """What is said of views whose points seem to have another unit than those of the others, if any."""
+    return next((said for _, said, _ in views_of_another_scale(start.lens.points)), None)
 
 
 def refuse_gaps(lens: ZoomLens, source: str) -> None:
