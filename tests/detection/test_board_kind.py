@@ -15,6 +15,7 @@ from support.real_data import RealFiles
 from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
 from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, seen_circles
 from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.markers.numbering import joined, layouts, lie_of, numbered
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.detection.placement import NoBoardError
@@ -191,6 +192,10 @@ def test_squares_in_a_grid_are_no_circles(side: int) -> None:
 )
 def test_things_in_rows_are_no_circles(kind: str, seed: int) -> None:
     assert seen_circles(no_boards.picture(kind, seed)) is None
+
+
+def test_things_in_shifted_rows_are_no_chessboard() -> None:
+    assert find_grids(no_boards.picture("windows", 186)) == []
 
 
 def test_circles_may_be_labelled_and_sharpened() -> None:

@@ -7,7 +7,8 @@ saddles are left over, `straighten` searches again in a view without the distort
 Lattices between round marks are left out. Between staggered circles the brightness has saddle points like
 those at the vertices of squares, and they form a grid. But a circle reaches equally far in all directions,
 where a square reaches 1.4 times as far towards its corners as towards its sides. Overexposed squares are
-smaller and blurred ones are rounder, but not so much.
+smaller and blurred ones are rounder, but not so much. And light and ink move all edges alike, so that squares
+with gaps along one axis alone, such as windows in shifted rows, are no chessboard.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
-    lattices = [x for x in _find(levels, wanted) if not between_round_marks(levels[0], x)]
+    lattices = [x for x in _find(levels, wanted) if _has_squares(levels[0], x)]
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 
@@ -237,6 +238,9 @@ def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
 # With these values test_finding.py tells photographs of circles from boards: the ratio is 0.71 to 0.74 on
 # circles, and at least 0.93 on boards.
 _ROUND = 0.82  # reach towards the corners over that towards the sides, both as shares of a square's own
+# Greatest difference of the gaps along both axes: squares, and px. It is at most 0.024 squares and 0.7 px on
+# boards, and 0.12 in windows in shifted rows (test_things_in_shifted_rows_are_no_chessboard).
+_GAP, _GAP_PX = 0.05, 1.0
 _APART = 0.8  # least level at the corners, from 0 of the square's own colour to 1 of the other
 _MOST = 60  # squares of a colour that are examined
 _FEWEST = 4
@@ -246,8 +250,8 @@ _PLACES = 0.5 + _RAYS[:, None] * _STEPS[:, None]  # (8, 21, 2) in the unit squar
 _CORNERS = weights_within(_PLACES.reshape(-1, 2))
 
 
-def between_round_marks(level: Level, lattice: Lattice) -> bool:
-    """Whether the squares of one colour are round, so that the lattice is no chessboard."""
+def _has_squares(level: Level, lattice: Lattice) -> bool:
+    """Whether the marks of a lattice are neither round nor have gaps along one axis alone."""
     quads = squares_of(lattice.pixels)
     known = np.isfinite(quads).all(axis=(2, 3))
     row, col = np.nonzero(known)
@@ -260,11 +264,8 @@ def between_round_marks(level: Level, lattice: Lattice) -> bool:
     dark = (row + col + lattice.dark) % 2 == 0
     groups = [_spread(np.flatnonzero(dark == colour)) for colour in (True, False)]
     if min(map(len, groups)) < _FEWEST:
-        return False
-    return any(
-        _relative_reach(interpolate(level.image, _CORNERS @ quads[row[some], col[some]]), step[some]) < _ROUND
-        for some in groups
-    )
+        return True
+    return all(_is_square(level, quads[row[some], col[some]], step[some]) for some in groups)
 
 
 def _spread(which: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
@@ -272,16 +273,24 @@ def _spread(which: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[tupl
     return which[:: -(-len(which) // _MOST)] if len(which) else which
 
 
-def _relative_reach(values: Array, step: Array) -> float:
-    """Median ratio of the reaches towards corners and sides.
+def _is_square(level: Level, quads: Array, step: Array) -> bool:
+    """Whether marks of one colour are square, by the median of their reaches in all directions.
 
-    `values` (N, rays * steps) [DN] is the brightness; `step` (N,) [DN] leads to that of the other colour.
+    `step` (N,) [DN] leads from the brightness in the middle of quadrangles (N, 4, 2) [px] to that of the other
+    colour.
     """
-    away = values.reshape(len(values), len(_RAYS), -1) - values[:, :1, None]
-    away /= np.where(step == 0, np.inf, step)[:, None, None]
-    if np.median(away[:, 4:, -1]) < _APART:
-        return 1.0  # squares touch at their corners
+    values = interpolate(level.image, _CORNERS @ quads).reshape(len(quads), len(_RAYS), -1)
+    away = (values - values[:, :1, :1]) / np.where(step == 0, np.inf, step)[:, None, None]
     beyond = away > 0.5
     reach = np.where(beyond.any(axis=-1), _STEPS[beyond.argmax(axis=-1)], _STEPS[-1])
     sides, corners = reach[:, :4].mean(axis=1), reach[:, 4:].mean(axis=1)
-    return float(np.median(corners / np.maximum(sides, _STEPS[1])))
+    apart = np.median(away[:, 4:, -1]) >= _APART  # else they touch at their corners
+    if apart and np.median(corners / np.maximum(sides, _STEPS[1])) < _ROUND:
+        return False
+    along, down = quads[:, 3] - quads[:, 0], quads[:, 2] - quads[:, 1]
+    area = 0.5 * np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
+    lengths = 0.5 * np.stack([np.hypot(*(along + way * down).T) for way in (1, -1)], axis=-1)
+    widths = area[:, None] / np.maximum(lengths, 1e-9)
+    gaps = (_STEPS[-1] - reach[:, :4].reshape(-1, 2, 2).mean(axis=2)) * widths
+    odd = abs(float(np.subtract(*np.median(gaps, axis=0))))
+    return bool(odd < max(_GAP * float(np.median(widths.min(axis=1))), _GAP_PX))
