@@ -276,8 +276,8 @@ def _spread(which: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[tupl
 def _is_square(level: Level, quads: Array, step: Array) -> bool:
     """Whether marks of one colour are square, by the median of their reaches in all directions.
 
-    `step` (N,) [DN] leads from the brightness in the middle of quadrangles (N, 4, 2) [px] to that of the other
-    colour.
+    The quadrangles (N, 4, 2) are in px; `step` (N,) [DN] leads from the light in their middles to that of the
+    other colour.
     """
     values = interpolate(level.image, _CORNERS @ quads).reshape(len(quads), len(_RAYS), -1)
     away = (values - values[:, :1, :1]) / np.where(step == 0, np.inf, step)[:, None, None]
