@@ -21,7 +21,7 @@ from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.problem import Motion, RigProblem
 from neurocal_cli.calibration.verdict.effects import step
-from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, Limit, in_sequence
+from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, Limit, in_sequence, likeliest
 from neurocal_cli.calibration.verdict.rival import ABSORBED, Cause, Found, Known, Pattern, Said, Unknowns
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
@@ -246,7 +246,7 @@ def named_cause(
         known = replace(known, n=degrees * rivals.independent(*ranking[0]))
         ranking = rivals.ranking(known)
     # Of those that are hardly less probable than the first, that which is the first in the list.
-    close = [one for one in ranking if one[0].evidence >= ranking[0][0].evidence - LEVEL]
+    close = likeliest((one[0].evidence, one) for one in ranking)
     found, subject = min(close, key=lambda one: causes.index(one[0].rival), default=(None, 0))
     if found is None or found.explained < EXPLAINED * (1.0 - degrees / known.cost):
         return None, rest

@@ -23,7 +23,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.two_view_points import PointBatch, WidePointBatch
-from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, log_odds
+from neurocal_cli.calibration.verdict.findings import EXPLAINED, likeliest, log_odds
 from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
@@ -215,13 +215,12 @@ def fault_of_matches(rig: StereoRig, left: Array, right: Array, limit: float) ->
         for what, error in errors.items()
     }
     n, choices = len(left), len(errors) - 1
-    odds = {
-        what: log_odds(squares[""], squares[what], n, choices=choices)
+    told = likeliest(
+        (log_odds(squares[""], squares[what], n, choices=choices), what)
         for what, error in errors.items()
         if what and (error <= limit).mean() > EXPLAINED
-    }
-    best = max(odds.values(), default=0.0)
-    return next((what for what, one in odds.items() if one > max(LEVEL, best - LEVEL)), "")
+    )
+    return next(iter(told), "")
 
 
 def _tries(rig: StereoRig, left: Array, right: Array) -> Iterator[tuple[str, _Try]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from neurocal_cli.observations.points import Correspondences
 WORDS = ("good", "usable", "poor")
 """By grade."""
 
+_Its = TypeVar("_Its")  # cause
 Finding = tuple[int, str, str]
 """Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
@@ -79,6 +81,16 @@ def log_odds(before: float, after: float, n: float, unknowns: float = 0.0, choic
     The noise is what it leaves, and the prior of each of its unknowns is worth one equation (Schwarz 1978).
     """
     return 0.5 * (n * float(np.log(before / after)) - unknowns * float(np.log(n))) - float(np.log(choices))
+
+
+def likeliest(causes: Iterable[tuple[float, _Its]]) -> list[_Its]:
+    """Of causes with their log odds, those that are more than chance and hardly less probable than the best.
+
+    They stay in their order; one whose odds are nan is unknown.
+    """
+    told = [(odds, cause) for odds, cause in causes if odds > LEVEL]
+    best = max((odds for odds, _ in told), default=0.0)
+    return [cause for odds, cause in told if odds > best - LEVEL]
 
 
 def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:

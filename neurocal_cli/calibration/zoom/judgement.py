@@ -17,10 +17,10 @@ from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.verdict.findings import (
     ELSEWHERE,
     ERROR,
-    LEVEL,
     SHARE,
     Finding,
     Limit,
+    likeliest,
     log_odds,
     verdict_of,
 )
@@ -97,7 +97,7 @@ def _causes(lens: ZoomLens) -> Iterator[Finding]:
     n, S, L, worst = 2 * int(lens.counts.sum()), len(lens.settings), len(lens.names), int(lens.rmse.argmax())
     largest = float(lens.rmse[worst])
     without = error**2 - max(largest**2 - floor**2, 0.0) * lens.counts[worst] * 2 / n
-    found = (
+    found: tuple[tuple[float, float, str, str], ...] = (
         (
             log_odds(error**2, without, n, L, S),
             largest / floor,
@@ -121,10 +121,8 @@ def _causes(lens: ZoomLens) -> Iterator[Finding]:
             "give --camera moving, or keep both where they are",
         ),
     )
-    best = max(evidence for evidence, *_ in found if not np.isnan(evidence))
-    for evidence, times, reason, advice in found:
-        if evidence > max(LEVEL, best - LEVEL):
-            yield ELSEWHERE.grade(times), reason, advice
+    for times, reason, advice in likeliest((one[0], one[1:]) for one in found):
+        yield ELSEWHERE.grade(times), reason, advice
 
 
 def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Finding]:
