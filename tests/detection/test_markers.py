@@ -17,9 +17,10 @@ from support.slow_cases import slow_but
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
-from neurocal_cli.detection.markers.lattice import place
+from neurocal_cli.detection.markers.lattice import leave_out_strays, place
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.detection.placement import NoBoardError
+from neurocal_cli.detection.wide_lens import Flattening, WideLens
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import TagPlane
@@ -379,3 +380,14 @@ def test_all_vertices_of_photographs_are_found(real_files: RealFiles) -> None:
         images = real_files(f"charuco_lifecam/{name}*.jpg")
         found = [detect_points(read_image(path).grey, board, "vertices") for path in images]
         assert sum(len(one.ids) for one in found) >= least
+
+
+def test_a_stray_far_beside_a_fisheyes_board_hides_no_other_stray() -> None:
+    """A ray at 90 degrees and more from the board's middle does not meet that plane."""
+    flattening = Flattening(WideLens(300.0, np.array([480.0, 360.0])), np.eye(3))
+    ground = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    found = flattening.pixels(40.0 * (ground - [4.0, 2.5]))
+    found[7], found[20] = (960.0, 360.0), found[20] + 9.0
+    contrast = np.ones(len(ground))
+    leave_out_strays(ground, found, contrast, flattening)
+    assert np.flatnonzero(np.isnan(contrast)).tolist() == [7, 20]

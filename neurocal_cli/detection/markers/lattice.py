@@ -190,8 +190,10 @@ def predicted(
     """Pixels (N, 2) of places (N, 2) by homographies of the known places around each; NaN far from these.
 
     Also (N, 2, 2) the steps of a square along both axes [px]. If not `itself`, a known place says nothing of
-    the same place.
+    the same place, and one whose ray does not meet the flattening's plane of no place.
     """
+    flat = flattening.flat(pixels)
+    known, flat = known[ahead := np.isfinite(flat).all(axis=1)], flat[ahead]
     away = np.abs(ground[:, None] - known).max(axis=2)
     if not itself:
         away[away < _SAME] = np.inf
@@ -199,7 +201,7 @@ def predicted(
     order = np.argsort(away, axis=1)[:, :count]
     near = np.take_along_axis(away, order, axis=1)
     weight = np.where(near < np.maximum(_AROUND, near[:, min(7, count - 1), None] + 1e-9), 1.0, 0.0)
-    H = homographies(known[order], flattening.flat(pixels)[order], weight)
+    H = homographies(known[order], flat[order], weight)
     step = 0.05
     around = np.array([[0, 0], [step, 0], [-step, 0], [0, step], [0, -step]])
     places = flattening.pixels(homography_at(H, ground[:, None] + around))
