@@ -76,7 +76,7 @@ def covariance_over_frames(fit: RigFit) -> Array:
     inverse = solve_scaled(reduced[np.ix_(free, free)], np.eye(len(free)))
     step = inverse @ reduced[free, -1]  # to the minimum, if the cameras were not refined
     # Of each column among the free ones; the residual comes after them.
-    number = np.full(len(fit.free) + 1, -1)  # of each column among the free ones and, the last, the residual
+    number = np.full(len(fit.free) + 1, -1)
     number[free], number[-1] = np.arange(len(free)), len(free)
     of_frames: list[list[tuple[NDArray[np.intp], Array]]] = [[] for _ in problem.scale]
     for one in views:
