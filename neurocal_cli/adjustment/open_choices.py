@@ -141,7 +141,7 @@ def open_coefficients(
     """
     own = coefficient_names(model)
     wide = model == "fisheye"
-    richer = DECENTRED if wide else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
+    richer = DECENTRED[model] if wide else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
     names = coefficient_names(richer)
     if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
         return None

@@ -37,9 +37,10 @@ WIDE = {
     "eucm": ("alpha", "beta"),
     "rich": ("k1", "k2", "k3", "k4", *rich_lens.NAMES),
 }
-DECENTRED = "decentred"
-"""A fisheye with p1 and p2. It is no choice of users: it tells what a fisheye leaves open."""
-BY_DIRECTION = {**WIDE, DECENTRED: (*WIDE["fisheye"], "p1", "p2")}
+DECENTRED = {model: f"decentred {model}" for model in ("fisheye", "double_sphere", "eucm")}
+"""These lenses with p1 and p2. They are no choice of users: they tell what these lenses leave open."""
+_CENTRED = {decentred: model for model, decentred in DECENTRED.items()}
+BY_DIRECTION = {**WIDE, **{decentred: (*WIDE[model], "p1", "p2") for decentred, model in _CENTRED.items()}}
 """Coefficients of all models of this module."""
 # Models whose first coefficient is xi; the scale in the image centre is alpha_u / (1 + xi).
 WITH_XI = ("omnidir", "double_sphere")
@@ -72,9 +73,10 @@ def project_directions(
         return _fisheye(k, X, Y, Z, q)
     if model == "omnidir":
         return _distorted(_by_divisor(X, Y, *_unified(k[0], q, Z)), k[1:])
-    if model == DECENTRED:
-        found = _distorted(_fisheye(k[:4], X, Y, Z, q), (0.0, 0.0, k[4], k[5]))
-        return found._replace(by_coefficient=[*found.by_coefficient[:4], *found.by_coefficient[6:]])
+    if model in _CENTRED:
+        centred = project_directions(_CENTRED[model], k[:-2], X, Y, Z)
+        found = _distorted(centred, (0.0, 0.0, *k[-2:]))
+        return found._replace(by_coefficient=[*found.by_coefficient[:-4], *found.by_coefficient[-2:]])
     if model == "rich":
         return _rich(k, X, Y, Z, q, by_coefficients)
     sphere = _double_sphere if model == "double_sphere" else _eucm

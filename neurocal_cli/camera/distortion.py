@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from neurocal_cli.camera.directions import BY_DIRECTION, DECENTRED, WIDE, project_directions
+from neurocal_cli.camera.directions import BY_DIRECTION, WIDE, project_directions
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
@@ -59,7 +59,7 @@ _PINHOLES = {
 
 def coefficient_names(model: str) -> tuple[str, ...]:
     """Names of a model's coefficients, in order; an InputError for an unknown model."""
-    if model == DECENTRED:
+    if model in BY_DIRECTION:
         return BY_DIRECTION[model]
     if model not in MODELS:
         raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(MODELS)}")

@@ -95,7 +95,7 @@ def test_a_decentred_fisheye_has_the_tangential_terms_after_its_polynomial() -> 
     k = [0.02, -0.01, 0.004, -0.001, 0.002, -0.003]
     rays = directions(np.linspace(0.1, 1.8, 20), np.linspace(0, 6, 20))
     x, y = (bent := project_directions("fisheye", k[:4], *rays.T)).x, bent.y
-    r2, found = x**2 + y**2, project_directions(DECENTRED, k, *rays.T)
+    r2, found = x**2 + y**2, project_directions(DECENTRED["fisheye"], k, *rays.T)
     np.testing.assert_allclose(found.x, x + 2 * k[4] * x * y + k[5] * (r2 + 2 * x**2), rtol=1e-12)
     np.testing.assert_allclose(found.y, y + k[4] * (r2 + 2 * y**2) + 2 * k[5] * x * y, rtol=1e-12)
 
@@ -104,7 +104,9 @@ def test_a_decentred_fisheye_has_the_tangential_terms_after_its_polynomial() -> 
 def test_derivatives_behind_the_camera_too(model: str) -> None:
     k = {
         "fisheye": [0.02, -0.01, 0.002, 0],
-        DECENTRED: [0.02, -0.01, 0.002, 0, 1e-3, 2e-3],
+        DECENTRED["fisheye"]: [0.02, -0.01, 0.002, 0, 1e-3, 2e-3],
+        DECENTRED["double_sphere"]: [-0.2, 0.6, 1e-3, 2e-3],
+        DECENTRED["eucm"]: [0.6, 1.1, 1e-3, 2e-3],
         "omnidir": [1.1, -0.1, 0.02, 1e-3, 2e-3],
         "double_sphere": [-0.2, 0.6],
     }.get(model, [0.6, 1.1])

@@ -241,11 +241,11 @@ class _Chain:
         It starts from the first state if that is one.
         """
         from neurocal_cli.calibration.verdict.findings import LEVEL
-        from neurocal_cli.calibration.verdict.rivals import DECENTRED
+        from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 
         problem, views = supported(self.problem, "omnidir"), self.problem.views
         state = fisheye.adjusted.state
-        if problem is None or not any(one.evidence > LEVEL for one in _causes(fisheye, (DECENTRED,))):
+        if problem is None or not any(one.evidence > LEVEL for one in _causes(fisheye, RICHER_LENSES)):
             return None
         starts = [first]
         if first.model != "omnidir":

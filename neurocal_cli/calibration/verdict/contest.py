@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.prior import STRETCH
-from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
@@ -30,7 +29,7 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
-from neurocal_cli.calibration.verdict.rivals import DECENTRED, EFFECTS, RIVALS, SHAPES, TOO_SIMPLE
+from neurocal_cli.calibration.verdict.rivals import EFFECTS, RICHER_LENSES, RIVALS, SHAPES
 from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -100,8 +99,7 @@ def contest(
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
-    effects = EFFECTS if named_lens else tuple(effect for effect in EFFECTS if effect is not DECENTRED.effect)
-    lin = linearised(views, state, free, free_poses, effects, image_size, named_lens)
+    lin = linearised(views, state, free, free_poses, EFFECTS, image_size, named_lens)
     if shaped:
         lin = _with_shape(lin)
     try:
@@ -146,10 +144,7 @@ def _held(lin: Linearised, worth: float) -> Contest:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, share)
         far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
-        # What a lens leaves that is decentred by much is known only when it is.
-        least = max(
-            least, (1.0 if chosen[0].rival is DECENTRED else _FAR if far else _MINOR) * chosen[0].evidence
-        )
+        least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
         for one in chosen:
             causes.append(one)
             alone = one is ranking[0]
@@ -259,18 +254,8 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
             adjust(views.subset(some).batches, state.of_views(some), free, True, NEARBY) for some in groups
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
-    if one.rival is DECENTRED:
-        from neurocal_cli.camera.nearest_camera import similar_states
-
-        free = np.append(np.isin(np.arange(5), lin.free), np.ones(5, dtype=bool))
-        starts = similar_states(state, "omnidir", farthest_angle(views, state))
-        each = [adjust(views.batches, start, free, True, NEARBY) for start in starts]
-        best = min(each, key=lambda fit: float(fit.cost.sum()), default=None)
-        return (
-            None if best is None else _Fit(float(best.cost.sum()), None, point_residuals(views, best.state))
-        )
     of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
-    if (of_given or one.rival.cause == TOO_SIMPLE) and one.explained > _EXPLAINS_MUCH:
+    if (of_given or one.rival in RICHER_LENSES) and one.explained > _EXPLAINS_MUCH:
         added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
         fit = adjust(views.batches, state, free, True, NEARBY)

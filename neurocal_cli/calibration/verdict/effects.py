@@ -17,6 +17,7 @@ from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen
 from neurocal_cli.calibration.verdict.rival import Pattern, Steps
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 
@@ -61,17 +62,6 @@ def moving(seen: Seen) -> Array | None:
         return None
     nearer = 1 / np.linalg.norm(seen.to_camera, axis=1)
     return seen.by_entries[:, 3:5] * (seen.pixels[:, 1] * nearer / nearer.mean())[:, None, None]
-
-
-def decentred(seen: Seen) -> Array | None:
-    """The tangential terms p1 and p2, in the image, of a wide lens whose model has none."""
-    if not seen.centred:
-        return None
-    x, y = seen.pixels[:, None, 0], seen.pixels[:, None, 1]
-    r2, by_u, by_v = x**2 + y**2, seen.by_entries[:, 3], seen.by_entries[:, 4]
-    return np.stack(
-        [2 * x * y * by_u + (r2 + 2 * y**2) * by_v, (r2 + 2 * x**2) * by_u + 2 * x * y * by_v], axis=1
-    )
 
 
 def cut(axis: int) -> Effect:
@@ -138,12 +128,13 @@ def given_lens(lin: Linearised) -> Array:
 
 
 def lens(model: str) -> Steps:
-    """The coefficients that a model has and the chosen one, which is not given with the camera, lacks."""
-    end = 5 + len(coefficient_names(model))
+    """The coefficients that a model has and the chosen one of its kind, unless that is given, lacks."""
+    wide, has = model in WIDE, coefficient_names(model)
 
     def steps(lin: Linearised) -> Array:
-        lacking = lin.columns["lens"]
-        return np.eye(lin.width)[:, lacking[lacking < (5 if 0 in lin.given else end)]]
+        names, lacking = coefficient_names(lin.state.model), lin.columns["lens"].tolist()
+        alike = lin.state.distortion.wide == wide and 0 not in lin.given
+        return np.eye(lin.width)[:, [k for k in lacking if alike and names[k - 5] in has] or slice(0)]
 
     return steps
 

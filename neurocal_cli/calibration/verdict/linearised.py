@@ -17,12 +17,13 @@ from neurocal_cli.adjustment.cross_validation import RIDGE
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, camera_columns, derivatives
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
+from neurocal_cli.camera.directions import DECENTRED
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
+_RICHER = {**dict.fromkeys(POLYNOMIAL_MODELS, POLYNOMIAL_MODELS[-1]), **DECENTRED}
 _FLAT = 0.02  # largest thickness over size of a board that counts as flat
 _ACROSS = 11  # points of a grid on the board
 _ALONG = 1e-6  # by which a normal that is an axis of the world may differ from it
@@ -66,7 +67,6 @@ class Seen:
     by_entries: Array  # (T, 5, 2, n) derivatives of the pixels by the entries of A
     pixels: Array  # (T, 2, n) where the camera sees the points, from the middle of the image; over S1
     observed: Array  # (T, 2, n) where they were observed [px]
-    centred: bool  # whether the distortion model is one of a wide lens that cannot be decentred
     # Derivatives (T, 3, 2, n) along the board, across it and along its normal, over its half length; the
     # places x, y (2, T, n) on it, over the same; and the directions (T, 3, n) to the camera along these axes.
     # They are None without a common flat board.
@@ -143,8 +143,8 @@ def linearised(
     The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
     estimated. `richer` asks for the coefficients that the distortion model lacks.
     """
-    if richer and state.model in POLYNOMIAL_MODELS[:-1]:
-        state = state.with_model(POLYNOMIAL_MODELS[-1])
+    if richer:
+        state = state.with_model(_RICHER.get(state.model, state.model))
     K, board = len(state.k), Board.of(views)
     middle = np.zeros(2)
     if image_size is not None:
@@ -175,7 +175,6 @@ def _derivatives(
 ) -> Iterator[tuple[slice, Array, dict[Effect, int]]]:
     """Derivatives (T, c + 7, 2, n) of chunks of the batches, and the widths of the effects among them."""
     batches, K = views.batches, len(state.k)
-    centred = state.model in WIDE and "p1" not in coefficient_names(state.model)
     for chunk in batches.chunks():
         view, observed = batches.view[chunk], batches.pixels[chunk]
         J = np.zeros((len(view), 12 + K, 2, observed.shape[2]))
@@ -189,7 +188,7 @@ def _derivatives(
                 off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
             off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
-        seen = Seen(J[:, :5], observed - off - middle[:, None], px, centred)
+        seen = Seen(J[:, :5], observed - off - middle[:, None], px)
         if board is not None:
             seen = _on_board(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}

@@ -22,33 +22,22 @@ _FLAT = "use a board that is flat, or measure its shape and give X,Y,Z as measur
 _STIFF = "fix the target to something stiff"
 _STILL = "keep camera and target still, or use a camera with a global shutter"
 _WHOLE = "give the images as the sensor has them, or calibrate each half as a camera of its own"
-TOO_SIMPLE = "a lens that is too simple"
-"""Name of the cause that the lens lacks coefficients."""
-DECENTRED = Rival(
-    TOO_SIMPLE,
-    "residuals of a wide lens that grow towards one side of the image",
-    "give --distortion auto or omnidir",
-    words.too_simple("omnidir"),
-    DISPLACED,
-    effects.common,
-    effect=effects.decentred,
+RICHER_LENSES = tuple(
+    Rival(
+        "a lens that is too simple",
+        "residuals that grow towards the corners, or one side, in the same way in all views",
+        "give --distortion auto, or a model with more coefficients",
+        words.too_simple(model),
+        DISPLACED,
+        effects.common,
+        steps=effects.lens(model),
+    )
+    for model in (*POLYNOMIAL_MODELS[1:], "omnidir")
 )
-"""A wide lens whose model has no tangential terms and needs them."""
+"""A lens that lacks coefficients."""
 
 RIVALS: tuple[Rival, ...] = (
-    *(
-        Rival(
-            TOO_SIMPLE,
-            "residuals that grow towards the corners in the same way in all views",
-            "give --distortion auto, or a model with more coefficients",
-            words.too_simple(model),
-            DISPLACED,
-            effects.common,
-            steps=effects.lens(model),
-        )
-        for model in POLYNOMIAL_MODELS[1:]
-    ),
-    DECENTRED,
+    *RICHER_LENSES,
     Rival(
         "a wrong given parameter",
         "the given focal length or centre, moved, takes the residuals away",
