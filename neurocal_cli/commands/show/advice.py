@@ -17,7 +17,7 @@ from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import outline_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
-from neurocal_cli.commands.show.text import printable
+from neurocal_cli.commands.show.text import attributes, printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,30 +92,17 @@ def rig_advice_lines(advice: RigAdvice) -> list[str]:
 
 def rig_advice_json(advice: RigAdvice) -> dict[str, Any]:
     """The same as values for JSON."""
-    return {
-        "weakest_share": advice.share,
-        "unit": advice.unit,
-        "views": [
-            {
-                "cameras": tie.cameras,
-                **_view_json(tie.view),
-                "std": tie.before,
-                "std_after": tie.after,
-            }
-            for tie in advice.views
-        ],
-    }
+    views = [
+        {"cameras": tie.cameras, **_view_json(tie.view), **attributes(tie, "std=before std_after=after")}
+        for tie in advice.views
+    ]
+    return {**attributes(advice, "weakest_share=share unit"), "views": views}
 
 
 def _view_json(view: Candidate) -> dict[str, Any]:
     return {
-        "position": view.position,
-        "width": view.width,
-        "tilt_deg": view.tilt,
-        "nearer_side_deg": view.way,
-        "roll_deg": view.roll,
-        "rotation": view.pose.R,
-        "translation": view.pose.t,
+        **attributes(view, "position width tilt_deg=tilt nearer_side_deg=way roll_deg=roll"),
+        **attributes(view.pose, "rotation=R translation=t"),
         "outline": view.outline,
     }
 

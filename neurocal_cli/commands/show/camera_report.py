@@ -17,6 +17,7 @@ from neurocal_cli.commands.show.text import (
     Table,
     align,
     align_views,
+    attributes,
     joined,
     labelled,
     outcome_json,
@@ -173,17 +174,11 @@ def _among(calibration: Calibration) -> str:
 def calibration_json(calibration: Calibration) -> dict[str, Any]:
     """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
     return {
-        "camera_name": calibration.camera_name,
-        "image_size": calibration.image_size,
+        **attributes(calibration, "camera_name image_size"),
         "n_points": len(calibration.points),
-        "n_rejected": calibration.n_rejected,
-        "unit": calibration.unit,
-        "type": calibration.type,
-        "method": calibration.method,
-        "distortion": calibration.distortion_model,
+        **attributes(calibration, "n_rejected unit type method distortion=distortion_model"),
         "parameters": parameters_json(calibration),
-        "rmse_px": calibration.rmse_px,
-        "max_px": calibration.max_px,
+        **attributes(calibration, "rmse_px max_px"),
         "views": {name: view.rmse_px for name, view in calibration.views.items()},
         "second_poses": {
             name: [_pose_json(one) for one in (calibration.views[name], second)]
@@ -282,11 +277,8 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[Table, Table]:
 
 def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> dict[str, Any]:
     """Convert an evaluation to JSON values; numbers that are not finite become None."""
-    names = ("rmse_px", "max_px", "rms_u", "rms_v", "bias_u", "bias_v")
     return {
-        "n_points": evaluation.n_points,
-        "n_behind": evaluation.n_behind,
-        **{name: getattr(evaluation, name) for name in names},
+        **attributes(evaluation, "n_points n_behind rmse_px max_px rms_u rms_v bias_u bias_v"),
         "views": {name: view.rmse_px for name, view in evaluation.views.items()},
         "fitted_views": evaluation.fitted_views,
         **verdict_json(verdict),
@@ -343,11 +335,10 @@ def plane_json(errors: PlaneErrors | None) -> dict[str, Any]:
         return {}
 
     def shares(spread: Spread) -> dict[str, float]:
-        return {"std": spread.std, "calibration": spread.by_calibration, "pixels": spread.by_pixel}
+        return attributes(spread, "std calibration=by_calibration pixels=by_pixel")
 
     at = {
-        "distance": errors.distance,
-        "sigma_px": errors.sigma,
+        **attributes(errors, "distance sigma_px=sigma"),
         "length": {"length": errors.length, **shares(errors.of_length)},
         "middle": shares(errors.of_middle),
         **({} if errors.of_depth is None else {"depth": shares(errors.of_depth)}),
@@ -368,11 +359,4 @@ def position_tables(positions: Mapping[str, CameraPosition], unit: str) -> list[
 
 def positions_json(positions: Mapping[str, CameraPosition]) -> dict[str, Any]:
     """The same as values for JSON, with covariances."""
-    return {
-        name: {
-            "point": place.point,
-            "std": place.std,
-            "covariance": place.covariance,
-        }
-        for name, place in positions.items()
-    }
+    return {name: attributes(place, "point std covariance") for name, place in positions.items()}

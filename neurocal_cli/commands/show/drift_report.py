@@ -17,6 +17,7 @@ from neurocal_cli.commands.show.figure import ACCENT, colour_bar, picture, plain
 from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
+    attributes,
     labelled,
     parameters,
     rounded,
@@ -131,11 +132,9 @@ def drift_json(drift: Drift) -> dict[str, Any]:
     at = {"u": u, "v": v, "px": drift.length[drift.worst], "std_px": drift.std[drift.worst]}
     changes = zip(_CHANGES, drift.changes, drift.changes_std, strict=True)
     return {
-        "different": drift.different,
-        "share": drift.share,
+        **attributes(drift, "different share"),
         "limit": SHARE,
-        "rms_px": drift.rms_px,
-        "expected_px": drift.rms_std,
+        **attributes(drift, "rms_px expected_px=rms_std"),
         "changes": {name: {"value": value, "std": std} for name, value, std in changes},
         "worst": at,
     }

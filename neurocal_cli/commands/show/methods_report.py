@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.evaluation import SpaceError
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.commands.show.figure import ACCENT, picture, style
 from neurocal_cli.commands.show.text import (
     Table,
     align,
+    attributes,
     joined,
     number,
     parameters,
@@ -145,9 +145,9 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         found["unit"] = comparison.unit
         found["stereo"] = {
             method: {
-                **_triangulated_json(one.by_view),
+                **attributes(one.by_view, "rmse nsce"),
                 "baseline": one.baseline,
-                "rig": None if one.rig is None else _triangulated_json(one.rig),
+                "rig": None if one.rig is None else attributes(one.rig, "rmse nsce"),
             }
             for method, one in comparison.stereo.items()
         }
@@ -160,15 +160,10 @@ def _camera_json(one: Compared) -> dict[str, Any]:
         return {"problem": one.problem}
     return {
         "rmse_px": calibration.rmse_px,
-        "held_out_px": one.held_out_px,
-        "seconds": one.seconds,
+        **attributes(one, "held_out_px seconds"),
         "distortion_model": calibration.distortion_model,
         "parameters": parameters_json(calibration),
     }
-
-
-def _triangulated_json(errors: SpaceError) -> dict[str, float | None]:
-    return {"rmse": errors.rmse, "nsce": errors.nsce}
 
 
 def simulation_tables(
@@ -285,10 +280,7 @@ def rig_study_json(study: RigStudy) -> dict[str, Any]:
     return {
         "trials": study.trials,
         "frames": len(study.rig.frames),
-        "sigma_px": study.sigma,
-        "rmse_px": study.rmse_px,
-        "place_mm": study.centre,
-        "rotation_rad": study.rotation,
+        **attributes(study, "sigma_px=sigma rmse_px place_mm=centre rotation_rad=rotation"),
         "error_over_std": study.over_std,
         "poses": {
             name: {"R": pose.R.tolist(), "t": pose.t.tolist()} for name, pose in study.rig.relative.items()
@@ -304,11 +296,9 @@ def simulation_json(
     if starts is None:
         return {**counts, **noise_json(study)}
     random_starts = {
-        "sigma": starts.sigma,
-        "best_rmse_px": starts.best,
+        **attributes(starts, "sigma best_rmse_px=best"),
         "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
-        "reached": starts.reached,
-        "rmse_px": starts.rms,
+        **attributes(starts, "reached rmse_px=rms"),
     }
     return {**counts, **noise_json(study), "random_starts": random_starts}
 
@@ -316,9 +306,7 @@ def simulation_json(
 def noise_json(study: NoiseStudy) -> dict[str, Any]:
     """The study of noise for JSON."""
     return {
-        "trials": study.trials,
-        "sigma": study.sigma,
-        "parameters": study.names,
+        **attributes(study, "trials sigma parameters=names"),
         "truth": _by_name(study, study.truth),
         "methods": {
             name: {
@@ -337,14 +325,9 @@ def noise_json(study: NoiseStudy) -> dict[str, Any]:
 def rates_json(study: RateStudy) -> dict[str, Any]:
     """The study of rates for JSON."""
     return {
-        "data_sets": study.sets,
-        "rates_weights": study.rates_weights,
-        "rates_gamma": study.rates_gamma,
-        "converged": study.converged,
-        "median_epochs": study.epochs,
+        **attributes(study, "data_sets=sets rates_weights rates_gamma converged median_epochs=epochs"),
         "default": {"rate_weights": study.default[0], "rate_gamma": study.default[1]},
-        "calibrated": study.calibrated,
-        "alpha_u_errors_in_std": study.alpha_u,
+        **attributes(study, "calibrated alpha_u_errors_in_std=alpha_u"),
     }
 
 

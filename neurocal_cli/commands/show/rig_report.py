@@ -14,6 +14,7 @@ from neurocal_cli.commands.show.text import (
     Table,
     align,
     align_views,
+    attributes,
     estimates,
     four_digits,
     joined,
@@ -35,7 +36,7 @@ _SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_EDGES = 20  # rows of a table that fit on a screen
 _MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
 _NAMED = 10  # views named in a remark
-_ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
+_ERRORS = "n_points n_behind rmse rmse_x rmse_y rmse_z max nsce epipolar_px relative"
 
 
 def rig_report(rig: Rig) -> str:
@@ -119,9 +120,7 @@ def rig_json(rig: Rig) -> dict[str, Any]:
         "poses": {name: {"R": pose.R, "t": pose.t, "std": rig.std[name]} for name, pose in rig.poses.items()},
         "edges": [{"cameras": pair, "views": count} for pair, count in rig.edges.items()],
         "delays": {name: {"value": value, "std": std} for name, (value, std) in rig.delays.items()},
-        "timed": rig.timed,
-        "rmse_px": rig.rmse_px,
-        "max_px": rig.max_px,
+        **attributes(rig, "timed rmse_px max_px"),
         "left_out": [[*view, why] for view, why in rig.left_out.items()],
         **outcome_json(rig),
     }
@@ -149,14 +148,11 @@ def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
     x, y, z = evaluation.by_axis.tolist()
     return {
         "n_points": len(evaluation.errors),
-        "n_behind": evaluation.n_behind,
-        "unit": evaluation.unit,
-        "rmse": evaluation.rmse,
+        **attributes(evaluation, "n_behind unit rmse"),
         "rmse_x": x,
         "rmse_y": y,
         "rmse_z": z,
-        "max": evaluation.largest,
-        "fitted": evaluation.fitted,
+        **attributes(evaluation, "max=largest fitted"),
         "cameras": {
             name: {"n_points": count, "predicted_rmse_px": error}
             for name, (count, error) in evaluation.predicted.items()
@@ -242,17 +238,12 @@ def stereo_json(rig: StereoRig) -> dict[str, Any]:
     return {
         "left": calibration_json(rig.left),
         "right": calibration_json(rig.right),
-        "unit": rig.unit,
-        "R": rig.R,
-        "t": rig.t,
-        "baseline": rig.baseline,
+        **attributes(rig, "unit R t baseline"),
         "parameters": {
             name: {"value": value, "std": rig.std[name]} for name, value in rig.pose.values.items()
         },
         "baseline_std": rig.std["baseline"],
-        "rmse_px": rig.rmse_px,
-        "max_px": rig.max_px,
-        "pairs": rig.pairs,
+        **attributes(rig, "rmse_px max_px pairs"),
         "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
         "delay": None if rig.delay is None else {"value": rig.delay[0], "std": rig.delay[1]},
         **outcome_json(rig),
@@ -313,10 +304,7 @@ def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
     """An evaluation as JSON values; None for numbers that do not exist."""
     return {
         **_error_json(evaluation.by_view),
-        "unit": evaluation.unit,
-        "baseline": evaluation.baseline,
-        "pairs": evaluation.pairs,
-        "fitted_views": evaluation.fitted,
+        **attributes(evaluation, "unit baseline pairs fitted_views=fitted"),
         "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
         **verdict_json(evaluation.verdict),
@@ -325,18 +313,9 @@ def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
 
 def _error_json(error: SpaceError) -> dict[str, Any]:
     return {
-        "n_points": error.n_points,
-        "n_behind": error.n_behind,
-        **{name: getattr(error, name) for name in _ERRORS},
+        **attributes(error, _ERRORS),
         "views": {name: rmse for name, (_, rmse) in error.views.items()},
         "depths": [
-            {
-                "from": part.nearest,
-                "to": part.farthest,
-                "n_points": part.n_points,
-                "rmse": part.rmse,
-                "relative": part.relative,
-            }
-            for part in error.depths
+            attributes(part, "from=nearest to=farthest n_points rmse relative") for part in error.depths
         ],
     }

@@ -182,14 +182,16 @@ def parameters_json(calibration: Calibration) -> dict[str, dict[str, Any]]:
     }
 
 
+def attributes(value: Any, names: str) -> dict[str, Any]:
+    """Attributes of an object for JSON, by their own names or, of ``name=attribute``, by others."""
+    words = (word.rpartition("=") for word in names.split())
+    return {name or own: getattr(value, own) for name, _, own in words}
+
+
 def outcome_json(result: Calibration | StereoRig | Rig) -> dict[str, Any]:
     """How the estimation of a result ended, for JSON."""
-    return {
-        "converged": result.converged,
-        "stop_reason": str.__str__(result.stop_reason),
-        "warnings": result.warnings,
-        **verdict_json(result.verdict),
-    }
+    ending = {"stop_reason": str.__str__(result.stop_reason), "warnings": result.warnings}
+    return {"converged": result.converged, **ending, **verdict_json(result.verdict)}
 
 
 def verdict_lines(verdict: Verdict | None) -> list[str]:
@@ -210,10 +212,7 @@ def verdict_lines(verdict: Verdict | None) -> list[str]:
 
 def verdict_json(verdict: Verdict | None) -> dict[str, Any]:
     """The entry `verdict` of a summary, empty without a verdict; measures that are not finite become None."""
-    if verdict is None:
-        return {}
-    names = ("word", "reasons", "advice", "measures")
-    return {"verdict": {name: getattr(verdict, name) for name in names}}
+    return {} if verdict is None else {"verdict": attributes(verdict, "word reasons advice measures")}
 
 
 def facts(verdict: Verdict) -> str:

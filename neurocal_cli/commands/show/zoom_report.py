@@ -21,6 +21,7 @@ from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
     align,
+    attributes,
     estimates,
     joined,
     labelled,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_SETTINGS = 8  # rows of a table
+_ERRORS = "n_points rmse_px max_px"
 _SCALES = {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}
 _TRAININGS = {
     "joint": "trained jointly",
@@ -106,17 +108,12 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
         "controls": lens.controls,
         "n_settings": len(lens.settings),
         "n_points": lens.counts.sum(),
-        "parameters": lens.names,
-        "distortion": lens.model,
-        "still": lens.still,
-        "known_cameras": lens.known,
-        "rmse_px": lens.rmse_px,
+        **attributes(lens, "parameters=names distortion=model still known_cameras=known rmse_px"),
         "noise_floor_px": None if lens.known else lens.noise_floor_px,
         "left_out_px": lens.left_out_px,
         "members": len(lens.members),
         "target": target_json(lens.target, lens.unit),
-        "converged": lens.converged,
-        "warnings": lens.warnings,
+        **attributes(lens, "converged warnings"),
         **verdict_json(judge_lens(lens)),
     }
 
@@ -160,16 +157,9 @@ def _baseline_rows(evaluation: LensEvaluation) -> Table:
 def evaluation_json(evaluation: LensEvaluation, verdict: Verdict) -> dict[str, Any]:
     """An evaluation as JSON values; None for numbers that do not exist."""
     return {
-        "n_points": evaluation.n_points,
-        "rmse_px": evaluation.rmse_px,
-        "max_px": evaluation.max_px,
+        **attributes(evaluation, _ERRORS),
         "settings": [
-            {
-                **{name: setting.values.get(name) for name in CONTROLS},
-                "n_points": setting.n_points,
-                "rmse_px": setting.rmse_px,
-                "max_px": setting.max_px,
-            }
+            {name: setting.values.get(name) for name in CONTROLS} | attributes(setting, _ERRORS)
             for setting in evaluation.settings
         ],
         "rivals": evaluation.baselines,
