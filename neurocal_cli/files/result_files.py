@@ -62,24 +62,15 @@ def write_result(
     if isinstance(result, Calibration):
         text = format_calibration(result, by_rows)
     else:
-        text = _rig_text(result, alpha, by_rows)
+        from neurocal_cli.files.rig_yaml import format_rig
+
+        text = format_rig(result, alpha, by_rows)
     if by_rows:
         from neurocal_cli.files.yaml_text import parse_yaml
 
         text = _lines(parse_yaml(text, "the calibration"), 3) + "\n"
     write_whole(path, text)
     return ()
-
-
-def _rig_text(rig: StereoRig | Rig, alpha: float | None, by_rows: bool) -> str:
-    from neurocal_cli.calibration.rig.rig import StereoRig
-    from neurocal_cli.files.rig_yaml import format_stereo_rig
-
-    if isinstance(rig, StereoRig):
-        return format_stereo_rig(rig, alpha, by_rows)
-    from neurocal_cli.files.rig_yaml import format_rig
-
-    return format_rig(rig, alpha, by_rows)
 
 
 def _lines(value: Any, depth: int, indent: str = "") -> str:

@@ -186,8 +186,10 @@ _RIG = Keys(
 )
 
 
-def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
+def format_rig(rig: Rig | StereoRig, alpha: float | None = None, by_rows: bool = False) -> str:
     """Text of a rig file; `alpha`, of two cameras, as in `rectify`, `by_rows` as in `format_calibration`."""
+    if isinstance(rig, StereoRig):
+        return format_stereo_rig(rig, alpha, by_rows)
     cameras = rig.cameras
     lines: Iterator[str] = iter(())
     if len(cameras) == 2:

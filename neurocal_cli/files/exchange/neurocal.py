@@ -22,7 +22,7 @@ from neurocal_cli.files.camera_tree import own_kind
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import Format
-from neurocal_cli.files.rig_yaml import format_rig, format_stereo_rig, rig_from_field, stereo_from_field
+from neurocal_cli.files.rig_yaml import format_rig, rig_from_field, stereo_from_field
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences
 
@@ -58,17 +58,17 @@ def without_points(root: Field, camera: CameraSet) -> Calibration:
 
 def camera_set(result: Calibration | StereoRig | Rig) -> CameraSet:
     """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
+    cameras: tuple[Camera, ...]
     if isinstance(result, Rig):
-        unit = None if result.unit == _UNKNOWN else result.unit
         cameras = tuple(replace(one.camera, name=name) for name, one in result.cameras.items())
-        poses = {name: view.pose for name, view in result.cameras[result.first].views.items()}
-        return CameraSet(cameras, tuple(result.poses.values())[1:], poses, unit, result, "neurocal")
-    left = result if isinstance(result, Calibration) else result.left
-    poses = {name: view.pose for name, view in left.views.items()}
+        first, relative = result.cameras[result.first], tuple(result.poses.values())[1:]
+    elif isinstance(result, StereoRig):
+        cameras, first, relative = (result.left.camera, result.right.camera), result.left, (result.pose,)
+    else:
+        cameras, first, relative = (result.camera,), result, ()
+    poses = {name: view.pose for name, view in first.views.items()}
     unit = None if result.unit == _UNKNOWN else result.unit
-    if isinstance(result, Calibration):
-        return CameraSet((result.camera,), (), poses, unit, result, "neurocal")
-    return CameraSet((left.camera, result.right.camera), (result.pose,), poses, unit, result, "neurocal")
+    return CameraSet(cameras, relative, poses, unit, result, "neurocal")
 
 
 def as_stereo(cameras: CameraSet) -> StereoRig:
@@ -141,9 +141,7 @@ def result_of(cameras: CameraSet) -> Calibration | StereoRig | Rig:
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     result = result_of(cameras)
-    if isinstance(result, Calibration):
-        return {"": format_calibration(result)}
-    return {"": format_rig(result) if isinstance(result, Rig) else format_stereo_rig(result)}
+    return {"": format_calibration(result) if isinstance(result, Calibration) else format_rig(result)}
 
 
 def _matches(document: Document) -> bool:

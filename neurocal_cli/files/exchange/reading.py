@@ -10,7 +10,7 @@ from pathlib import Path
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.presented import Converted
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.errors import (
     FormatError,
@@ -287,7 +287,7 @@ def read_intrinsics(
     distortion: str | None = None,
 ) -> Camera:
     """Read a single camera without its poses, from any file of `read_cameras`."""
-    return _single(Document(str(path), notes, warnings, distortion)).cameras[0]
+    return camera_of(read_given_camera(path, notes, warnings, distortion))
 
 
 def read_given_camera(
@@ -298,17 +298,12 @@ def read_given_camera(
 ) -> Camera | Calibration:
     """Read a single camera without its poses; of a neurocal file also the covariance of its parameters."""
     document = Document(str(path), notes, warnings, distortion)
-    found = _single(document)
-    if found.program == "neurocal":
-        return neurocal.without_points(document.root, found)
-    return found.cameras[0]
-
-
-def _single(document: Document) -> CameraSet:
     found = _read(document, whole=False)
     if len(found.cameras) > 1:
         raise FormatError("is a rig; give the file of one camera", document.source)
-    return found
+    if found.program == "neurocal":
+        return neurocal.without_points(document.root, found)
+    return found.cameras[0]
 
 
 def _read(document: Document, whole: bool = True) -> CameraSet:
