@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.document import Document, assignments
+from neurocal_cli.files.exchange.document import Document, stated
 from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import in_order, in_rows
 from neurocal_cli.files.tree_fields import Field, is_number
@@ -120,9 +120,8 @@ NUSCENES = Format(
 
 # Middlebury and ETH3D: a rectified pair, whose second camera is at (baseline, 0, 0) of the first.
 def _middlebury_parts(document: Document) -> dict[str, Tree]:
-    stated = assignments(document.text)
-    root = Field({name: value.tolist() for name, value in stated.items()}, document.source)
-    width, height, baseline = (float(root[key].array(1, 1)[0, 0]) for key in ("width", "height", "baseline"))
+    root = Field(stated(document.text) or {}, document.source)
+    width, height, baseline = (root[key].number() for key in ("width", "height", "baseline"))
     common = {"size": [width, height], "R": np.eye(3).tolist(), "t": [-baseline, 0.0, 0.0]}
     return {name: {"K": root[name].value, **common} for name in ("cam0", "cam1")}
 

@@ -57,11 +57,10 @@ _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(
     r"\A(?:[^\S\n]*(?:[#;][^\n]*)?\n)*[^\S\n]*\[[^\]\n,]+\][^\S\n]*(?:[#;][^\n]*)?(?:\n|\Z)"
 ).match
-_ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)
 # name = numbers or name: numbers, as programs print them and scripts state them.
 _STATED = re.compile(
     r"^[ \t]*([A-Za-z][\w. ]*?)[ \t]*(?:[:=]|\n)\s*(?:[\w.]+\()?\s*"
-    r"(\[[-+.\deE,;\s\[\]]*\]|[-+]?\.?\d[-+.\deE]*(?=[ \t;,]*(?:[#%/][^\n]*)?(?:\n|\Z)))",
+    r"(\[[-+.\deENa,;\s\[\]]*\]|[-+]?\.?\d[-+.\deE]*(?=[ \t;,]*(?:[#%/][^\n]*)?(?:\n|\Z)))",
     re.MULTILINE,
 )
 # A matrix as NumPy prints it, without commas.
@@ -156,7 +155,8 @@ class Document:
             root = parse_tree(text, self.source)
         except FormatError as error:
             failed, root = error, Field("", self.source)
-        if (root.value is None or isinstance(root.value, str)) and (tree := stated(text)) is not None:
+        named = root.value is None or isinstance(root.value, str)
+        if named and len(text) <= _LONGEST and (tree := stated(text)) is not None:
             self.is_script = bool(_MATLAB(text))
             return Field(tree, self.source)
         if failed is not None:
@@ -318,11 +318,10 @@ def stated(text: str) -> dict[str, Any] | None:
     if len(lines) == 2 and len(lines[0]) == len(set(lines[0])) == len(lines[1]) > 3:
         tree: dict[str, Any] = dict(zip(lines[0], map(_value, lines[1]), strict=True))
         return None if any(map(is_number, lines[0])) else tree
-    if len(text) > _LONGEST:
-        return None
     tree = {}
     text = _FILLED.sub(r"\1 = [\2]", re.sub(r"^[ \t]*#define", "", text, flags=re.MULTILINE))
     text = re.sub(r"(?:[%#]|//)[^\n]*", "", text)
+    text = re.sub(r";(?![^\[\]]*\])", "\n", text)  # behind a statement, not in a matrix
     rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
     if all(len(row) > 1 and all(map(is_number, row[1:])) for row in rows):
         counts = [len(row) for row in rows]
@@ -349,16 +348,3 @@ def stated(text: str) -> dict[str, Any] | None:
             numbers = [[float(word) for word in part] for part in parts if part]
             tree[name] = numbers if nested or len(numbers) > 1 else (numbers or [[]])[0]
     return tree if len(tree) > 1 else None
-
-
-def assignments(text: str) -> dict[str, Any]:
-    """Variables of a MATLAB script that assigns numbers: arrays of one column, or matrices."""
-    found: dict[str, Any] = {}
-    for name, value in _ASSIGNMENT.findall(re.sub(r"%[^\n]*", "", text)):
-        rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", value.strip("[]"))]
-        rows = [row for row in rows if row]
-        try:
-            found[name] = np.array(rows, dtype=float)
-        except ValueError:  # ragged, or no numbers
-            continue
-    return found

@@ -16,7 +16,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_names import matrix_of
 from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector
-from neurocal_cli.files.exchange.document import Document, assignments
+from neurocal_cli.files.exchange.document import Document, stated
 from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.mat_file import MARK, lists, saved
@@ -134,8 +134,10 @@ _RIGHT = PoseKeys("om T", from_first=True)
 
 
 def _bouguet_root(document: Document) -> Field:
-    script = _SCRIPT(document.text)
-    return Field(lists(assignments(document.text)), document.source) if script else document.root
+    if not _SCRIPT(document.text):
+        return document.root
+    variables = {name: np.array(value) for name, value in (stated(document.text) or {}).items()}
+    return Field(lists(variables), document.source)
 
 
 def _sides(root: Field) -> list[str]:
