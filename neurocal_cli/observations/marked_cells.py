@@ -104,7 +104,7 @@ def printed_rectangles(plane: Plane) -> tuple[Array, Array, NDArray[np.bool_]]:
     markers = plane.markers
     assert markers is not None
     dictionary = named_dictionary(plane)
-    how = Print(legacy=bool(markers.legacy) and not isinstance(plane, TagPlane))
+    how = next(prints(plane))
     cells = marked_cells(plane, how)
     within = pattern_lines(plane, dictionary)
     dark = patterns(plane, cells, dictionary, how)

@@ -70,6 +70,21 @@ def test_a_grid_of_aruco_markers_is_opencv_s() -> None:
     assert (mine == (picture < 128)).mean() > 0.999
 
 
+@pytest.mark.skipif(not hasattr(cv2, "aruco"), reason="this OpenCV has no markers")
+@pytest.mark.parametrize("rows", [6, 5])
+def test_the_legacy_pattern_is_opencv_s(rows: int) -> None:
+    text = CHARUCO.replace("auto", "true").replace("[8, 6]", f"[8, {rows}]").replace("id: 4", "id: 0")
+    (plane,) = parse_board(text).planes
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    opencv = cv2.aruco.CharucoBoard((8, rows), 40.0, 30.0, family)
+    opencv.setLegacyPattern(True)
+    picture = opencv.generateImage((8 * 80, rows * 80), None, 0, 1)
+    x, y, dark = printed_rectangles(plane)
+    v, u = np.indices(picture.shape) + 0.5
+    mine = dark[np.searchsorted(y, v / 80.0 - 1), np.searchsorted(x, u / 80.0 - 1)]
+    assert (mine == (picture < 128)).mean() > 0.99
+
+
 def test_asymmetric_circles_lie_as_opencv_says() -> None:
     (plane,) = parse_board("kind: asymmetric_circles\ncircles: [4, 11]\ndistance: 20\n").planes
     assert isinstance(plane, CirclePlane)
