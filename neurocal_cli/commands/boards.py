@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from math import gcd
 from typing import TYPE_CHECKING
@@ -249,6 +250,21 @@ def compare_markers(paths: Sequence[str], board: Board) -> None:
         raise NoBoardError(f"{told}: correct its description, or leave it out")
     if found.sure and shown.rows != plane.rows:
         warn(f"{told}: it has another number of rows")
+
+
+def with_other_kind(outcomes: list[Outcome], board: Board) -> list[Outcome]:
+    """The outcomes; if none has the board, and images show another kind, that is their problem."""
+    from neurocal_cli.detection.board_kind import other_kind
+
+    paths = [outcome.path for outcome in outcomes if not outcome.unread]
+    if any(outcome.detection is not None for outcome in outcomes) or not paths:
+        return outcomes
+    with suppress(NeurocalError):  # standard input is read once
+        images = _readable(_spread(paths)[:_COMPARED], lambda text, share: None)
+        if told := other_kind(images, board.planes[0]):
+            name = "{}: {}".format
+            return [one if one.unread else replace(one, problem=name(one.path, told)) for one in outcomes]
+    return outcomes
 
 
 def _spread(paths: Sequence[str]) -> list[str]:

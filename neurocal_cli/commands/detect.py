@@ -18,6 +18,7 @@ from neurocal_cli.commands.boards import (
     compare_markers,
     complain_of,
     described_board,
+    with_other_kind,
 )
 from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
@@ -266,8 +267,12 @@ def _examined(
         outcomes, prepared = [], wanted.options(paths)
         with ProgressBar() as progress:
             for outcome in detect_files(paths, prepared, jobs or default_jobs(len(paths))):
-                outcomes.append(replace(outcome, problem=outcome.problem.removeprefix(folder)))
+                outcomes.append(outcome)
                 progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
+        outcomes = [
+            replace(outcome, problem=outcome.problem.removeprefix(folder))
+            for outcome in with_other_kind(outcomes, prepared.board)
+        ]
     return dict(zip(names, outcomes, strict=True))
 
 

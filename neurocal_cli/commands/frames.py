@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from neurocal_cli.commands.boards import with_other_kind
 from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line, say
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, plural
 
@@ -129,7 +130,7 @@ def watch_for_images(
                     complain(f"{path}: {error}")
                     continue
                 for name in waiting:
-                    outcomes[name] = detect_file(name, options)
+                    (outcomes[name],) = with_other_kind([detect_file(name, options)], options.board)
                     _tell(name, outcomes, options)
                 waiting.clear()
                 last = time.monotonic()

@@ -29,6 +29,7 @@ from neurocal_cli.detection.markers.found import SeenMarkers, agreed_markers, se
 from neurocal_cli.detection.placement import End, NoBoardError, board_ends
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board_kinds import found_words
 
 Size = tuple[int, int]  # columns and rows of inner vertices, the larger number first
 
@@ -269,6 +270,10 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
         raise NoBoardError(
             "no image shows a chessboard, markers or circles; show the whole board, sharp and evenly lit"
         )
+    return _agreed(seen)
+
+
+def _agreed(seen: _Seen) -> FoundBoard:
     if seen.kind is seen.squares:
         size = agreed_size(seen.squares)
         return FoundBoard(Plane("", *size.size, 1.0), size.sure)
@@ -278,6 +283,22 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
 def _marked(seen: _Seen) -> FoundBoard:
     found = agreed_markers(seen.marked)
     return FoundBoard(found.plane, found.sure, found.doubts)
+
+
+def other_kind(images: Iterable[NDArray[np.generic]], described: Plane) -> str:
+    """What grey images show, if it is of another kind than a described board; empty if it is not."""
+    seen = _Seen()
+    for image in images:
+        seen.add(image, all_kinds=True)
+    if not seen.kind:
+        return ""
+    try:
+        plane = _agreed(seen).plane
+    except NoBoardError as error:
+        return "" if seen.kind is seen.squares else str(error)
+    if type(plane) is type(described) and (plane.markers is None) == (described.markers is None):
+        return ""
+    return f"the image shows {found_words(plane)}; correct the description of the board, or leave it out"
 
 
 def find_board(images: Iterable[NDArray[np.generic]], square: float = 1.0, unit: str = "squares") -> Board:

@@ -1,7 +1,6 @@
 """Detect labelled points in one image, or say what it shows instead.
 
-`detect_points` runs all steps on one image: `find_grids`, `identify`, `measure` and `label`. An image without
-a chessboard is searched for other targets, markers or a grid of circles, to name them.
+`detect_points` runs all steps on one image: `find_grids`, `identify`, `measure` and `label`.
 """
 
 from __future__ import annotations
@@ -9,20 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import dark_ellipses
 from neurocal_cli.detection.circles.measuring import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grey import grey_image, negative
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located, identify
 from neurocal_cli.detection.markers.locate import locate
-from neurocal_cli.detection.markers.reading import codes_in
 from neurocal_cli.detection.measuring import Points, linearised, measure
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import check_kind
@@ -197,14 +193,7 @@ def _identified(image: NDArray[np.generic], board: Board, grids: list[Grid] | No
         return locate_circles(board, image)
     if not is_plain(board):
         return locate(board, image)
-    found = grids_in(image, board) if grids is None else grids
-    try:
-        return identify(board, found, image)
-    except NoBoardError as error:
-        other = other_target(image)
-        if other:
-            raise NoBoardError(other) from error
-        raise
+    return identify(board, grids_in(image, board) if grids is None else grids, image)
 
 
 def _measured(image: NDArray[np.generic], located: Located, points: Points, gamma: float | None) -> Measured:
@@ -248,93 +237,3 @@ def label(located: Located, measured: Measured) -> Labels:
     along_x, along_y = np.rint(np.abs(second - first)).astype(bool).T
     kind = np.where(along_x, EDGE_H, np.where(along_y, EDGE_V, VERTEX))
     return Labels(located.plane, kind, start)
-
-
-# With these limits test_other_targets.py recognises nothing in noise, blurred boards and sample images.
-_LONGEST = 1000  # px; larger images are reduced to this longer side, which still shows a target's marks
-_MARKERS = 3  # different ones of one family; noise sometimes gives one
-_IDS = 100  # first markers of a family that count; boards usually have them, and noise rarely
-_SMALLEST = 0.05  # least perimeter of a marker, in longer sides of the image; its bits are 2 px wide then
-_WINDOW = 23  # px of the adaptive threshold; one window is fast, and enough to find a few markers
-_FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
-_CIRCLES = 16
-_EVEN = 0.5  # greatest spread of the distances between neighbours over their median
-_ALIKE = 1.0  # greatest logarithm of an area over the median area
-
-
-def other_target(grey: NDArray[np.generic]) -> str:
-    """Message about the other target that a grey image shows; empty if none is recognised."""
-    small = _small(grey)
-    if _shows_markers(small):
-        return (
-            "the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; leave out --cols and "
-            "--rows, so that the board is found, or describe it by --board, for example charuco:8x6:28:21"
-        )
-    if _shows_circles(small) or _shows_circles(255 - small):
-        return (
-            "the image shows a grid of circles, no chessboard; leave out --cols and --rows, so that the "
-            "board is found, or describe it by --board, for example circles:7x6:20"
-        )
-    return ""
-
-
-def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Reduce a large image, to 8 bits as well."""
-    while max(grey.shape) >= 2 * _LONGEST and min(grey.shape) > 1:  # exact halves are fast
-        even = np.ascontiguousarray(grey[: len(grey) // 2 * 2, : grey.shape[1] // 2 * 2])
-        grey = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    scale = min(1.0, _LONGEST / max(grey.shape))
-    if scale < 1:
-        size = [max(1, round(scale * length)) for length in grey.shape[::-1]]
-        grey = cv2.resize(np.ascontiguousarray(grey), size, interpolation=cv2.INTER_AREA)
-    if grey.dtype == np.uint8:
-        return np.ascontiguousarray(grey, dtype=np.uint8)
-    brightest = max(int(grey.max(initial=1)), 1)
-    return (grey.astype(float) * (255.0 / brightest)).astype(np.uint8)
-
-
-def _shows_markers(grey: NDArray[np.uint8]) -> bool:
-    aruco = getattr(cv2, "aruco", None)  # missing in older builds of OpenCV
-    if aruco is None or not hasattr(aruco, "ArucoDetector"):
-        return False
-    parameters = aruco.DetectorParameters()
-    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW
-    parameters.minMarkerPerimeterRate = _SMALLEST
-    # The quadrangles do not depend on the family, so they are looked for once.
-    corners, _, rejected = aruco.ArucoDetector(aruco.getPredefinedDictionary(0), parameters).detectMarkers(
-        grey
-    )
-    found = codes_in(grey, np.array([*corners, *rejected], dtype=float).reshape(-1, 4, 2))
-    numbers = (marks.number for marks, _ in found if marks.dictionary in _FAMILIES)
-    return any(np.count_nonzero(number < _IDS) >= _MARKERS for number in numbers)
-
-
-def _shows_circles(image: NDArray[np.uint8]) -> bool:
-    """Whether an image shows enough dark ellipses of similar size, evenly spaced.
-
-    Blurred squares look like ellipses, too, but not at three levels of brightness.
-    """
-    middle, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    found = _ellipses(image, middle)
-    if len(found) < _CIRCLES:
-        return False
-    apart = _apart(found, found)
-    np.fill_diagonal(apart, np.inf)
-    low, usual, high = np.quantile(apart.min(axis=1), [0.1, 0.5, 0.9])
-    others = (_ellipses(image, 0.5 * (middle + end)) for end in np.quantile(image, [0.02, 0.98]))
-    return high - low <= _EVEN * usual and all(
-        np.count_nonzero(_apart(found, one).min(axis=1, initial=np.inf) < 0.2 * usual) >= _CIRCLES
-        for one in others
-    )
-
-
-def _ellipses(image: NDArray[np.uint8], level: float) -> Array:
-    """Centres (n, 2) of the dark ellipses of about the median size."""
-    area, *centre = dark_ellipses(image, level).T
-    usual = np.median(area) if len(area) else 1.0
-    return np.stack(centre, axis=1)[np.abs(np.log(area / usual)) < _ALIKE]
-
-
-def _apart(first: Array, second: Array) -> Array:
-    """(n, m) distances."""
-    return np.asarray(np.hypot(*(first[:, None] - second).transpose(2, 0, 1)))

@@ -11,8 +11,11 @@ import pytest
 from support.command_line import run
 from support.places import SAMPLES
 
-from neurocal_cli.detection.detect import other_target
+from neurocal_cli.detection.board_kind import other_kind
 from neurocal_cli.files.images import read_image
+from neurocal_cli.observations.board import Plane
+
+DESCRIBED = Plane("", 9, 6, 25.0)
 
 
 def photographed(target: np.ndarray) -> np.ndarray:
@@ -35,51 +38,59 @@ def markers(kind: str) -> np.ndarray:
 
 def circles(staggered: bool, light: bool = False) -> np.ndarray:
     image = np.full((750, 1000), 20 if light else 255, dtype=np.uint8)
-    for row in range(8):
+    step, radius = (40, 18) if staggered else (80, 26)
+    for row in range(15 if staggered else 8):
         for column in range(10):
-            middle = (90 + 80 * column + (40 if staggered and row % 2 else 0), 80 + 80 * row)
-            cv2.circle(image, middle, 26, 240 if light else 0, -1, cv2.LINE_AA)
+            middle = (90 + 80 * column + (40 if staggered and row % 2 else 0), 80 + step * row)
+            cv2.circle(image, middle, radius, 240 if light else 0, -1, cv2.LINE_AA)
     return image
 
 
 @pytest.mark.skipif(not hasattr(cv2, "aruco"), reason="this OpenCV has no markers")
-@pytest.mark.parametrize("kind", ["charuco", "aruco"])
-def test_markers_are_recognised(kind: str) -> None:
-    assert "markers (ChArUco" in other_target(photographed(markers(kind)))
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("charuco", "the image shows a ChArUco board of 8 x 6 squares"),
+        ("aruco", "6 x 4 markers that stand alone"),
+    ],
+)
+def test_markers_are_recognised(kind: str, said: str) -> None:
+    assert said in other_kind([photographed(markers(kind))], DESCRIBED)
 
 
 @pytest.mark.parametrize(("staggered", "light"), [(False, False), (True, False), (True, True)])
 def test_grids_of_circles_are_recognised(staggered: bool, light: bool) -> None:
-    assert "grid of circles" in other_target(photographed(circles(staggered, light)))
+    said = f"the image shows a grid of {'10 x 15 asymmetric' if staggered else '10 x 8'} circles"
+    assert said in other_kind([photographed(circles(staggered, light))], DESCRIBED)
     deep = photographed(circles(staggered, light)).astype(np.uint16) * 200
-    assert "grid of circles" in other_target(deep)
+    assert said in other_kind([deep], DESCRIBED)
 
 
 @pytest.mark.parametrize("blur", [0.0, 3.0, 8.0])
 def test_no_other_target_is_seen_in_chessboards(blur: float) -> None:
     image = np.array(read_image(SAMPLES / "board02.png").grey)
-    assert other_target(cv2.GaussianBlur(image, (0, 0), blur) if blur else image) == ""
+    assert other_kind([cv2.GaussianBlur(image, (0, 0), blur) if blur else image], DESCRIBED) == ""
 
 
 def test_no_target_is_seen_in_noise() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
-    assert other_target(noise) == ""
-    assert other_target(cv2.GaussianBlur(noise, (0, 0), 3.0)) == ""
-    assert other_target(np.zeros((1, 1), dtype=np.uint8)) == ""
+    assert other_kind([noise], DESCRIBED) == ""
+    assert other_kind([cv2.GaussianBlur(noise, (0, 0), 3.0)], DESCRIBED) == ""
+    assert other_kind([np.zeros((1, 1), dtype=np.uint8)], DESCRIBED) == ""
 
 
 @pytest.mark.slow
 def test_no_other_target_is_seen_in_real_images(real_files: Callable[[str], list[Path]]) -> None:
     for pattern in ("opencv_stereo/*.jpg", "sony_chess/*.jpg", "fisheye_stereo/*.jpg", "zhang_planar/*.png"):
         for path in real_files(pattern):
-            assert other_target(np.array(read_image(path).grey)) == "", path.name
+            assert other_kind([np.array(read_image(path).grey)], DESCRIBED) == "", path.name
 
 
 def test_detect_says_what_the_image_shows(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "dots.png"), photographed(circles(False)))
     result = run("detect", tmp_path / "dots.png", "--cols", 9, "--rows", 6, "--square", 25)
     assert result.exit_code == 1
-    assert "dots.png: the image shows a grid of circles, no chessboard; " in result.stderr
+    assert "dots.png: the image shows a grid of 10 x 8 circles; correct the description" in result.stderr
     assert "evenly lit" not in result.stderr
 
 

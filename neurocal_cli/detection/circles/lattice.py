@@ -104,11 +104,6 @@ def _distinct(looks: list[Array]) -> Blobs:
     return Blobs(every[kept, 1:3], every[kept, 0])
 
 
-def dark_ellipses(image: NDArray[np.uint8], level: float) -> Array:
-    """Areas and centres (N, 3) of the parts of an image below a level that are ellipses."""
-    return _ellipses(_outlines(image < level), image)
-
-
 def _outlines(dark: NDArray[np.bool_], origin: tuple[int, int] = (0, 0)) -> list[NDArray[Any]]:
     """Outlines (P, 2) of what may be ellipses in a mask, whose first pixel is at `origin`.
 
