@@ -1,10 +1,12 @@
 """Points in space from their pixels in any number of cameras, in the first camera's frame.
 
 Each point has the smallest squared reprojection error over the cameras that saw it, each weighted by the
-noise of its pixels. Gauss-Newton begins at the point nearest to all rays, which is so near that halved steps
-do for damping: the iteration is not that of `adjustment.levenberg_marquardt`. If the error of a point seen by
-three cameras or more is too large, one of them may show another point: the camera without which the others
-agree is named, and left out.
+noise of its pixels. It is C + B (x, y, 1) / w, where C is the centre of the first camera that saw it and the
+third column of B the ray of its pixel there. So x and y stay small wherever the ray points, w is one over the
+distance, and points at any distance up to infinity need few steps of Gauss-Newton. Halved steps do for
+damping: the iteration is not that of `adjustment.levenberg_marquardt`. If the error of a point seen by three
+cameras or more is too large, one of them may show another point: the camera without which the others agree is
+named, and left out.
 """
 
 from __future__ import annotations
@@ -16,9 +18,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
@@ -27,8 +30,8 @@ from neurocal_cli.errors import InputError
 
 _MAX_STEPS, _HALVINGS = 30, 8
 _SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
+# A rise of the squared error by less, as a factor and in px^2, is rounding.
 _RISE, _ROUNDING = 1 + 1e-9, 1e-18
-_RIDGE = 1e-14
 
 
 @frozen_dataclass(eq=False)
@@ -103,127 +106,135 @@ def triangulate_many(
             f"point {twice // len(names)} is twice in camera {names[twice % len(names)]}; a camera sees a "
             "point once"
         )
-    views = [
-        (one.camera if isinstance(one, Calibration) else one, poses[name]) for name, one in cameras.items()
-    ]
-    n = 1 + int(point.max(initial=-1))
-    whole = _Views(views, noise, point, rows, pixels, n)
+    views, n = [camera_of(one) for one in cameras.values()], 1 + int(point.max(initial=-1))
+    whitening = None if (noise == 1).all() else np.eye(2) / noise[rows, None, None]
+    relative = np.stack([poses[name].D for name in names])
+    whole = Sightings(views, rows, pixels, whitening, point, n, relative, rows)
     with np.errstate(all="ignore"):
-        found = whole.fitted()
-        return _without_contradictions(whole, found, limit)
+        return _without_contradictions(whole, _found(whole), limit)
 
 
 @frozen_dataclass(eq=False)
-class _Views:
-    """Pixels of n points in some cameras."""
+class Sightings:
+    """Pixels of n points in some cameras, of each of which a point has one at most."""
 
-    cameras: Sequence[tuple[Camera, Pose]]
-    noise: Array  # (C,) of each camera's pixels
-    point: NDArray[np.intp]  # (M,)
-    camera: NDArray[np.intp]  # (M,)
+    cameras: Sequence[Camera]
+    camera: NDArray[np.intp]  # (M,) that saw each pixel
     pixels: Array  # (M, 2)
+    whitening: Array | None  # (M, 2, 2) of the pixels' errors; None if their noise is alike
+    point: NDArray[np.intp]  # (M,)
     n: int
+    poses: Array  # (P, 3, 4) [R | t] of cameras, X_camera = R X + t
+    pose: NDArray[np.intp]  # (M,) that of the camera
 
-    def summed(self, values: Array) -> Array:
-        """Sums over the rows of each point, (M, ...) -> (n, ...)."""
-        out = np.zeros((self.n, *values.shape[1:]))
-        order, starts = self.sorted
-        if len(starts):
-            out[self.point[order[starts]]] = np.add.reduceat(values[order], starts, axis=0)
-        return out
+    def only(self, rows: NDArray[np.bool_], numbers: NDArray[np.intp], n: int) -> Sightings:
+        """Some of the pixels, whose n points have these numbers."""
+        whitening = None if self.whitening is None else self.whitening[rows]
+        return replace(
+            self, camera=self.camera[rows], pixels=self.pixels[rows], whitening=whitening,
+            point=numbers[self.point[rows]], n=n, pose=self.pose[rows],
+        )  # fmt: skip
+
+    @cached_property
+    def rows(self) -> list[NDArray[np.intp]]:
+        """Of each camera, the rows of its pixels."""
+        return [np.flatnonzero(self.camera == k) for k in range(len(self.cameras))]
 
     @cached_property
     def rays(self) -> Array:
         """(M, 3) viewing directions in the cameras' frames."""
         rays = np.empty((len(self.point), 3))
-        for k, (camera, _) in enumerate(self.cameras):
-            mine = self.camera == k
+        for camera, mine in zip(self.cameras, self.rows, strict=True):
             rays[mine] = camera.unproject(self.pixels[mine])
         return rays
 
-    @cached_property
-    def sorted(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The rows in the order of their points, and where each point begins."""
-        order = np.argsort(self.point, kind="stable")
-        return order, np.flatnonzero(np.diff(self.point[order], prepend=-1))
+    def compared(self, inside: Array, by: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Normal matrices (n, k + 1, k + 1), bordered by right side and cost, and which points all see.
 
-    def only(self, rows: NDArray[np.bool_]) -> _Views:
-        return replace(self, point=self.point[rows], camera=self.camera[rows], pixels=self.pixels[rows])
-
-    def nearest(self) -> Array:
-        """(n, 3) the points with the smallest sum of squared distances from their rays."""
-        normal, right = np.zeros((len(self.point), 3, 3)), np.zeros((len(self.point), 3))
-        for k, (_, pose) in enumerate(self.cameras):
-            mine = self.camera == k
-            rays = self.rays[mine] @ pose.R
-            across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-            normal[mine] = across
-            right[mine] = across @ (-pose.R.T @ pose.t)
-        fine = np.isfinite(normal).all(axis=(1, 2))
-        normal[~fine], right[~fine] = 0.0, 0.0
-        N = self.summed(normal)
-        return _solved(N, self.summed(right))
-
-    def linearised(self, X: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Normal matrices (n, 3, 3), right sides (n, 3), squared errors (n,), and which points all see."""
-        J, r, seen = (
-            np.zeros((len(self.point), 2, 3)),
-            np.zeros((len(self.point), 2)),
-            np.ones(len(self.point), bool),
-        )
-        for k, (camera, pose) in enumerate(self.cameras):
-            mine = np.flatnonzero(self.camera == k)
-            if not mine.size:
-                continue
-            inside = X[self.point[mine]] @ pose.R.T + pose.t
-            projected, fine = camera.project(inside)
+        `inside` (M, 3) are the points in the cameras' frames, and `by` (M, 3, k) their derivatives.
+        """
+        N = np.zeros((self.n, by.shape[2] + 1, by.shape[2] + 1))
+        seen = np.ones(self.n, dtype=bool)
+        for camera, mine in zip(self.cameras, self.rows, strict=True):
+            own, point = inside[mine], self.point[mine]
+            projected, fine = camera.project(own)
+            J = camera.project_jacobian(own)[1] @ by[mine]
+            J = np.concatenate([J, (self.pixels[mine] - projected)[..., None]], axis=2)
+            J = J if self.whitening is None else self.whitening[mine] @ J
+            N[point] += np.swapaxes(J, 1, 2) @ J
             # A pixel's ray has one side only.
-            fine = fine & ((inside * self.rays[mine]).sum(axis=1) > 0)
-            J[mine] = camera.project_jacobian(inside)[1] @ pose.R
-            r[mine], seen[mine] = self.pixels[mine] - projected, fine
-        J /= self.noise[self.camera, None, None]
-        r /= self.noise[self.camera, None]
-        Jt = np.swapaxes(J, 1, 2)
-        all_seen = self.summed((~seen).astype(float)) == 0
-        return (
-            self.summed(Jt @ J),
-            self.summed((Jt @ r[..., None])[..., 0]),
-            self.summed((r * r).sum(axis=1)),
-            all_seen,
-        )
+            seen[point] &= fine & ((own * self.rays[mine]).sum(axis=1) > 0)
+        return N, seen
 
-    def fitted(self) -> SpacePoints:
-        """The least-squares points of all rows."""
-        X = self.nearest()
-        N, g, cost, seen = self.linearised(X)
+    def fitted(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Least-squares points (n, 3), covariances (n, 6), squared errors, and which points are behind.
+
+        They are nan for points that the pixels do not determine.
+        """
+        first = np.zeros(self.n, dtype=np.intp)
+        first[self.point[::-1]] = np.arange(len(self.point))[::-1]
+        pose = self.poses[self.pose[first]]
+        back = np.swapaxes(pose[:, :, :3], 1, 2)
+        B, C = back @ _basis(self.rays[first]), -back @ pose[:, :, 3:]
+        R, t = self.poses[self.pose, :, :3], self.poses[self.pose, :, 3:]
+        by = np.concatenate([R @ B[self.point], R @ C[self.point] + t], axis=2)  # of x, y, 1 and w
+        by_q = by[:, :, [0, 1, 3]]
+        # On the first ray, at the distance whose images are nearest to the other rays.
+        across, along = (np.cross(self.rays, by[:, :, k]) for k in (2, 3))
+        both = ((along * other).sum(axis=1) for other in (across, along))
+        w = np.divide(*(np.bincount(self.point, sums, self.n) for sums in both))
+        q = np.stack([np.zeros_like(w), np.zeros_like(w), -w], axis=1)
+
+        def at(q: Array) -> tuple[Array, NDArray[np.bool_]]:
+            whole = np.column_stack([q[:, :2], np.ones(self.n), q[:, 2]])[self.point]
+            return self.compared(np.einsum("mij,mj->mi", by, whole), by_q)
+
+        N, seen = at(q)
         for _ in range(_MAX_STEPS):
-            step = np.nan_to_num(_solved(N, g))
-            if (
-                not np.sqrt(np.einsum("ni,nij,nj->n", step, np.nan_to_num(N), step)).max(initial=0.0)
-                > _SMALL_STEP
-            ):
+            step = np.nan_to_num(solve_scaled(N[:, :3, :3], N[:, :3, 3:], ROUNDING)[..., 0])
+            moved = np.einsum("ni,nij,nj->n", step, np.nan_to_num(N[:, :3, :3]), step)
+            if not moved.max(initial=0.0) > _SMALL_STEP**2:
                 break
+            cost = N[:, 3, 3]
             for _ in range(_HALVINGS):
-                trial = self.linearised(X + step)
-                worse = ~(trial[2] <= cost * _RISE + _ROUNDING) & np.isfinite(cost)
+                trial = at(q + step)
+                worse = ~(trial[0][:, 3, 3] <= cost * _RISE + _ROUNDING) & np.isfinite(cost)
                 if not worse.any():
                     break
                 step[worse] *= 0.5
             else:
                 step[worse] = 0.0
-                trial = self.linearised(X + step)
-            X, (N, g, cost, seen) = X + step, trial
-        count = np.bincount(self.point, minlength=self.n)
-        few = count < 2
-        inverse = _inverse(N)
+                trial = at(q + step)
+            q, (N, seen) = q + step, trial
+        x, y, w = q.T
+        along_q = np.stack([x, y, np.ones_like(w)], axis=1)[..., None] / w[:, None, None]
+        moved_by = B @ (np.eye(3) * [1, 1, 0] - along_q * [0, 0, 1]) / w[:, None, None]
+        points = (C + B @ along_q)[..., 0]
+        inverse = moved_by @ solve_scaled(N[:, :3, :3], np.swapaxes(moved_by, 1, 2), ROUNDING)
         a, b = np.triu_indices(3)
-        covariance, error = inverse[:, a, b], np.sqrt(cost / np.maximum(2 * count - 3, 1))
-        lost = few | ~np.isfinite(X).all(axis=1) | ~np.isfinite(covariance).all(axis=1)
-        X[lost], covariance[lost], error[lost] = np.nan, np.nan, np.nan
-        return SpacePoints(X, covariance, error, count, np.full(self.n, -1), lost | ~seen)
+        covariance, cost = inverse[:, a, b], N[:, 3, 3]
+        lost = ~np.isfinite(points).all(axis=1) | ~np.isfinite(covariance).all(axis=1)
+        lost |= np.bincount(self.point, minlength=self.n) < 2
+        points[lost], covariance[lost], cost[lost] = np.nan, np.nan, np.nan
+        return points, covariance, cost, lost | ~seen | ~(w > 0)
 
 
-def _without_contradictions(whole: _Views, found: SpacePoints, limit: float) -> SpacePoints:
+def _basis(rays: Array) -> Array:
+    """(n, 3, 3) right-handed unit vectors, the third of which is the ray."""
+    # The coordinate axis that is most across the ray.
+    first = np.cross(np.eye(3)[np.argmin(np.abs(rays), axis=1)], rays)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(rays, first), rays], axis=2)
+
+
+def _found(seen: Sightings) -> SpacePoints:
+    points, covariance, cost, behind = seen.fitted()
+    count = np.bincount(seen.point, minlength=seen.n)
+    error = np.sqrt(cost / np.maximum(2 * count - 3, 1))
+    return SpacePoints(points, covariance, error, count, np.full(seen.n, -1), behind)
+
+
+def _without_contradictions(whole: Sightings, found: SpacePoints, limit: float) -> SpacePoints:
     """Leave out the one camera without which the others agree, where a point's error exceeds the limit."""
     wrong = (found.n_cameras >= 3) & ~(found.error <= limit)
     if not wrong.any() or not np.isfinite(limit):
@@ -235,9 +246,8 @@ def _without_contradictions(whole: _Views, found: SpacePoints, limit: float) -> 
         some = wrong & has
         if not some.any():
             continue
-        numbers = np.cumsum(some) - 1
         rows = some[whole.point] & (whole.camera != k)
-        part = replace(whole.only(rows), point=numbers[whole.point[rows]], n=int(some.sum())).fitted()
+        part = _found(whole.only(rows, np.cumsum(some) - 1, int(some.sum())))
         places = np.flatnonzero(some)
         better = (part.error <= limit) & ~part.behind & ~(part.error >= best.error[places])
         kept = places[better]
@@ -250,19 +260,3 @@ def _without_contradictions(whole: _Views, found: SpacePoints, limit: float) -> 
         contradicts[kept] = k
         best = replace(best, **changes, contradicts=contradicts)
     return best
-
-
-def _solved(N: Array, g: Array) -> Array:
-    """Solutions (n, 3) of symmetric systems; nan where they are singular."""
-    return np.asarray((_inverse(N) @ g[..., None])[..., 0])
-
-
-def _inverse(N: Array) -> Array:
-    """Inverses (n, 3, 3) of symmetric matrices; not finite where they are singular."""
-    trace = np.trace(N, axis1=1, axis2=2)
-    fine = np.isfinite(N).all(axis=(1, 2)) & (
-        np.abs(np.linalg.det(np.nan_to_num(N))) > (_RIDGE * trace) * trace**2
-    )
-    out = np.full_like(N, np.nan)
-    out[fine] = np.linalg.inv(N[fine])
-    return out

@@ -19,16 +19,18 @@ from typing import Any, Literal, get_args, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.cross_validation import solve_or_nan
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.many_views import Sightings
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.calibration.rig.rig import StereoRig
-from neurocal_cli.calibration.rig.two_view_points import PointBatch, WidePointBatch
+from neurocal_cli.calibration.rig.two_view_points import PointBatch
 from neurocal_cli.calibration.verdict.findings import EXPLAINED, likeliest, log_odds
 from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, check_choice
@@ -149,21 +151,68 @@ def triangulate(
     elif which is None or len(which) != n:
         raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
     wide = any(_sees_sideways(camera, seen) for camera, seen in zip(cameras, pixels, strict=True))
-    batch_type: type[PointBatch] | type[WidePointBatch] = WidePointBatch if wide else PointBatch
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
     covariance = np.empty((n, 6)) if method == "optimal" else None
     with np.errstate(all="ignore"):
         for start in range(0, n, _BLOCK):
             rows = slice(start, start + _BLOCK)
+            left_seen, right_seen = pixels[0][rows], pixels[1][rows]
             factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
             rig = np.moveaxis(rigs if which is None else rigs[which[rows]], 0, -1)
-            batch = batch_type(cameras, rig, pixels[0][rows].T, pixels[1][rows].T, factors)
-            if covariance is None:
-                points[rows] = batch.linear() if method == "linear" else batch.midpoint()
-                epipolar[rows], behind[rows] = batch.compare(points[rows])
-            else:
+            if covariance is not None and not wide:
+                batch = PointBatch(cameras, rig, left_seen.T, right_seen.T, factors)
                 points[rows], covariance[rows], epipolar[rows], behind[rows] = batch.optimal()
+                continue
+            seen = _sightings(cameras, rig, left_seen, right_seen, factors)
+            if covariance is not None:
+                points[rows], covariance[rows], cost, behind[rows] = seen.fitted()
+            else:
+                points[rows] = _midpoint(seen) if method == "midpoint" else _linear(seen, wide)
+                whole = np.column_stack([points[rows], np.ones(seen.n)])[seen.point]
+                inside = (seen.poses[seen.pose] @ whole[..., None])[..., 0]
+                N, in_front = seen.compared(inside, np.zeros((len(inside), 3, 0)))
+                cost, behind[rows] = N[:, 0, 0], ~in_front
+            epipolar[rows] = np.sqrt(cost)
     return Triangulated(points, covariance, epipolar, behind)
+
+
+def _sightings(
+    cameras: tuple[Camera, Camera], rig: Array, left: Array, right: Array, factors: tuple[Array, Array] | None
+) -> Sightings:
+    """The pixels of both cameras; the rig (3, 4, n or 1) and the factors are as for `PointBatch`."""
+    n, m = len(left), rig.shape[2]
+    side, whitening = np.repeat([0, 1], n), None
+    if factors is not None:
+        whitening = np.zeros((2 * n, 2, 2))
+        whitening[:, 0, 0], whitening[:, 0, 1], whitening[:, 1, 1] = np.concatenate(factors, axis=1)
+    pose = np.append(np.zeros(n, dtype=np.intp), 1 + np.arange(n) % m)
+    poses = np.concatenate([np.eye(3, 4)[None], np.moveaxis(rig, -1, 0)])
+    return Sightings(
+        cameras, side, np.concatenate([left, right]), whitening, np.tile(np.arange(n), 2), n, poses, pose
+    )
+
+
+def _midpoint(seen: Sightings) -> Array:
+    """(n, 3) the points with the smallest sum of squared distances from both rays."""
+    R, t = seen.poses[seen.pose, :, :3], seen.poses[seen.pose, :, 3:]
+    back = np.swapaxes(R, 1, 2)
+    rays = back @ seen.rays[..., None]
+    across = np.eye(3) - rays * np.swapaxes(rays, 1, 2)
+    left, right = np.split(np.concatenate([across, across @ (-back @ t)], axis=2), 2)
+    both = left + right
+    return solve_or_nan(both[:, :, :3], both[:, :, 3])
+
+
+def _linear(seen: Sightings, wide: bool) -> Array:
+    """(n, 3) smallest singular vectors of the image equations, or of rays along their points."""
+    rows = cross_matrix(seen.rays) if wide else cross_matrix(seen.rays / seen.rays[:, 2:])[:, :2]
+    equations = np.concatenate(np.split(rows @ seen.poses[seen.pose], 2), axis=1)
+    nowhere = ~np.isfinite(equations).all(axis=(1, 2))
+    equations[nowhere] = np.eye(equations.shape[1], 4)
+    last = np.linalg.svd(equations)[2][:, 3]
+    points = last[:, :3] / last[:, 3:]
+    points[nowhere] = np.nan
+    return np.asarray(points)
 
 
 def _pixels(values: Array) -> Array:

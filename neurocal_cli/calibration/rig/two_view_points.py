@@ -1,13 +1,9 @@
-"""Triangulation of some thousand points at a time, by least squares and by simpler methods.
+"""Least-squares points of two ordinary cameras, some thousand at a time.
 
-`PointBatch`: Gauss-Newton estimates the point as (x, y, 1) / w. Its left image depends on x and y alone, and
-its right image is nearly linear in w at any distance up to infinity, so two or three steps are enough. The
-iteration is not that of `adjustment.levenberg_marquardt`: each point has three unknowns, and their equations
-are written out over all points.
-
-`WidePointBatch` is for wide lenses, whose rays may be 90 degrees and more from the axis. The point is
-B (x, y, 1) / w, where the third column of B is the ray of its left pixel: x and y stay small wherever the ray
-points, and w is one over the distance. The iteration is the same.
+Gauss-Newton estimates the point as (x, y, 1) / w. Its left image depends on x and y alone, and its right
+image is nearly linear in w at any distance up to infinity, so two or three steps are enough. It is the
+iteration of `many_views.Sightings` with the equations written out over all points, which takes a fraction of
+its time.
 """
 
 from __future__ import annotations
@@ -18,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.geometry import Array, cross_matrix
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import nearly_undistorted
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 
@@ -44,14 +40,9 @@ class PointBatch:
         whitening: tuple[Array, Array] | None,
     ) -> None:
         self.cameras, self.pixels, self.whitening = cameras, (left, right), whitening
-        self.P = rig
         # Plain numbers for a common rig are faster than arrays of one element.
         entries = rig[..., 0].tolist() if rig.shape[2] == 1 else rig
         self.R, self.t = [row[:3] for row in entries], [row[3] for row in entries]
-
-    def _rays(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        (left, right), (left_pixels, right_pixels) = self.cameras, self.pixels
-        return left.normalised_points(*left_pixels), right.normalised_points(*right_pixels)
 
     def _image(self, side: int, x: Array, y: Array) -> tuple[Array, Array, tuple[Any, Any, Any, Any]]:
         """Pixels of normalised points in one image, and du/dx, du/dy, dv/dx, dv/dy."""
@@ -75,10 +66,10 @@ class PointBatch:
             if not moved.max(initial=0.0) > _SMALL_STEP:
                 break
             x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
-        points, covariance = self._in_space(
-            np.stack([x / w, y / w, 1 / w], axis=1), _point_covariance(_inverse_entries(N), x, y, w)
-        )
-        behind = left_out | ~(w > 0) | ~self._in_front(x, y, w)
+        points = np.stack([x / w, y / w, 1 / w], axis=1)
+        covariance = _point_covariance(_inverse_entries(N), x, y, w)
+        depth = self.R[2][0] * x + self.R[2][1] * y + self.R[2][2] + w * self.t[2]  # in the right camera
+        behind = left_out | ~(w > 0) | ~(depth > 0)
         epipolar = np.sqrt(cost)
         points[left_out], covariance[left_out], epipolar[left_out] = np.nan, np.nan, np.nan
         return points, covariance, epipolar, behind
@@ -90,14 +81,6 @@ class PointBatch:
             for camera, pixels in zip(self.cameras, self.pixels, strict=True)
         )
         return x, y, self._nearest_w(x, y, *right)
-
-    def _in_front(self, x: Array, y: Array, w: Array) -> NDArray[np.bool_]:
-        """Which points with positive w the right camera sees."""
-        return np.asarray(self._depth(x, y, w) > 0)
-
-    def _in_space(self, points: Array, covariance: Array) -> tuple[Array, Array]:
-        """Points and covariances in the left camera's frame from those of (x, y, 1) / w."""
-        return points, covariance
 
     def _descend(
         self, state: tuple[Array, Array, Array], step: list[Array], N: list[Array], cost: Array
@@ -127,11 +110,6 @@ class PointBatch:
         t0, t1, t2 = self.t
         a, b = t0 - x_r * t2, t1 - y_r * t2
         return np.asarray((a * (x_r * h2 - h0) + b * (y_r * h2 - h1)) / (a * a + b * b))
-
-    def _depth(self, x: Array, y: Array, w: Array) -> Array:
-        """Depth in the right camera times w."""
-        row = self.R[2]
-        return np.asarray(row[0] * x + row[1] * y + row[2] + w * self.t[2])
 
     def _normal(self, x: Array, y: Array, w: Array) -> tuple[list[Array], Array]:
         """Normal equations: xx, xy, xw, yy, yw, ww, then the right-hand sides x, y, w; and the cost."""
@@ -173,38 +151,6 @@ class PointBatch:
             by_u.append(ux * dx + uy * dy)
             by_v.append(vx * dx + vy * dy)
         return u, v, (by_u[0], by_u[1], by_u[2]), (by_v[0], by_v[1], by_v[2])
-
-    def linear(self) -> Array:
-        """(n, 3) smallest singular vectors of the image equations."""
-        P, rays = np.moveaxis(self.P, -1, 0), self._rays()
-        equations = np.zeros((len(self.pixels[0][0]), 4, 4))
-        equations[:, 0, 0] = equations[:, 1, 1] = -1.0
-        equations[:, 0, 2], equations[:, 1, 2] = rays[0]
-        for row, ray in enumerate(rays[1]):
-            equations[:, 2 + row] = ray[:, None] * P[:, 2] - P[:, row]
-        return _nearest_solution(equations)
-
-    def midpoint(self) -> Array:
-        """(n, 3) midpoints of the shortest segments between the rays."""
-        left_ray, (x, y) = self._rays()
-        left = np.stack([*left_ray, np.ones_like(x)])
-        # Rays and centre of the right camera in the left one's frame.
-        right = np.stack([self.R[0][k] * x + self.R[1][k] * y + self.R[2][k] for k in range(3)])
-        centre = np.stack([-sum(self.R[j][k] * self.t[j] for j in range(3)) + 0.0 * x for k in range(3)])
-        ll, lr, rr = ((a * b).sum(axis=0) for a, b in ((left, left), (left, right), (right, right)))
-        lc, rc = (left * centre).sum(axis=0), (right * centre).sum(axis=0)
-        det = ll * rr - lr * lr
-        along_left, along_right = (rr * lc - lr * rc) / det, (lr * lc - ll * rc) / det
-        return np.asarray(0.5 * (along_left * left + centre + along_right * right)).T
-
-    def compare(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Distances of the points' images from the pixels [px], and which points are behind."""
-        X, Y, Z = points.T
-        w = 1.0 / Z
-        x, y = X * w, Y * w
-        _, cost = self._normal(x, y, w)
-        behind = ~(Z > 0) | ~(self._depth(x, y, w) > 0) | ~np.isfinite(cost)
-        return np.sqrt(cost), behind
 
 
 def _solve(N: list[Array]) -> list[Array]:
@@ -253,130 +199,9 @@ def _point_covariance(inverse: list[Array], x: Array, y: Array, w: Array) -> Arr
     )
 
 
-class WidePointBatch(PointBatch):
-    """The same for wide lenses."""
-
-    def __init__(
-        self,
-        cameras: tuple[Camera, Camera],
-        rig: Array,
-        left: Array,
-        right: Array,
-        whitening: tuple[Array, Array] | None,
-    ) -> None:
-        super().__init__(cameras, rig, left, right, None)
-        self.rows = left.T, right.T
-        self.P = np.broadcast_to(np.moveaxis(rig, -1, 0), (left.shape[1], 3, 4))
-        self.turns, self.shifts = self.P[:, :, :3], self.P[:, :, 3]
-        self.factors = None if whitening is None else tuple(_upper(factors) for factors in whitening)
-        self.left, self.right = cameras[0].unproject(self.rows[0]), cameras[1].unproject(self.rows[1])
-        lost = ~np.isfinite(self.left[:, 0] + self.right[:, 0])
-        self.basis = _basis(np.where(lost[:, None], [0.0, 0.0, 1.0], self.left))
-
-    def _start(self) -> tuple[Array, Array, Array]:
-        """On the left ray, at one over the distance whose image is nearest to the right ray."""
-        across = np.cross(self.right, (self.turns @ self.left[..., None])[..., 0])
-        along = np.cross(self.right, self.shifts)
-        w = -(across * along).sum(axis=1) / (along * along).sum(axis=1)
-        return np.zeros_like(w), np.zeros_like(w), w
-
-    def _normal(self, x: Array, y: Array, w: Array) -> tuple[list[Array], Array]:
-        J, r, _ = self._linearised(np.column_stack([x, y, w]))
-        Jt = np.swapaxes(J, 1, 2)
-        a, b = np.triu_indices(3)
-        return [*(Jt @ J)[:, a, b].T, *(Jt @ r[..., None])[..., 0].T], (r * r).sum(axis=1)
-
-    def _in_front(self, x: Array, y: Array, w: Array) -> NDArray[np.bool_]:
-        return self._linearised(np.column_stack([x, y, w]))[2]
-
-    def _in_space(self, points: Array, covariance: Array) -> tuple[Array, Array]:
-        whole = covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        a, b = np.triu_indices(3)
-        turned = self.basis @ whole @ np.swapaxes(self.basis, 1, 2)
-        return (self.basis @ points[..., None])[..., 0], turned[:, a, b]
-
-    def _linearised(self, q: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Derivatives (n, 4, 3) of both pixels by x, y, w; what is missing (n, 4); and which are seen."""
-        basis, m = self.basis, (self.basis @ np.column_stack([q[:, :2], np.ones(len(q))])[..., None])[..., 0]
-        h = (self.turns @ m[..., None])[..., 0] + q[:, 2:] * self.shifts
-        by_left, left, seen_left = self._seen(0, m)
-        by_right, right, seen_right = self._seen(1, h)
-        turned = self.turns @ basis[:, :, :2]
-        J = np.concatenate(
-            [
-                np.concatenate([by_left @ basis[:, :, :2], np.zeros((len(q), 2, 1))], axis=2),
-                by_right @ np.concatenate([turned, self.shifts[:, :, None]], axis=2),
-            ],
-            axis=1,
-        )
-        return J, np.concatenate([left, right], axis=1), seen_left & seen_right
-
-    def _seen(self, side: int, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Derivatives of pixels by points, what is missing to the observed ones, and what is seen."""
-        camera = self.cameras[side]
-        pixels, seen = camera.project(points)
-        by_point, missing = camera.project_jacobian(points)[1], self.rows[side] - pixels
-        if self.factors is not None:
-            factors = self.factors[side]
-            by_point, missing = factors @ by_point, (factors @ missing[..., None])[..., 0]
-        return by_point, missing, seen
-
-    def linear(self) -> Array:
-        """(n, 3) smallest singular vectors of the equations that each ray is parallel to its point."""
-        rows = [cross_matrix(self.left) @ np.eye(3, 4), cross_matrix(self.right) @ self.P]
-        return _nearest_solution(np.concatenate(rows, axis=1))
-
-    def midpoint(self) -> Array:
-        """(n, 3) midpoints of the shortest segments between the rays."""
-        back = np.swapaxes(self.turns, 1, 2)
-        left, right = self.left, (back @ self.right[..., None])[..., 0]
-        centre = -(back @ self.shifts[..., None])[..., 0]
-        cosine = (left * right).sum(axis=1)
-        lc, rc = (left * centre).sum(axis=1), (right * centre).sum(axis=1)
-        det = 1.0 - cosine * cosine
-        along_left, along_right = (lc - cosine * rc) / det, (cosine * lc - rc) / det
-        return np.asarray(0.5 * (along_left[:, None] * left + centre + along_right[:, None] * right))
-
-    def compare(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Distances of the points' images from the pixels [px], and which points are behind."""
-        in_right = (self.turns @ points[..., None])[..., 0] + self.shifts
-        _, left, seen_left = self._seen(0, points)
-        _, right, seen_right = self._seen(1, in_right)
-        epipolar = np.sqrt((left * left).sum(axis=1) + (right * right).sum(axis=1))
-        # A pixel's ray has one side only.
-        before = ((points * self.left).sum(axis=1) > 0) & ((in_right * self.right).sum(axis=1) > 0)
-        return epipolar, ~(seen_left & seen_right & before & np.isfinite(epipolar))
-
-
-def _basis(rays: Array) -> Array:
-    """(n, 3, 3) right-handed unit vectors, the third of which is the ray."""
-    # The coordinate axis that is most across the ray.
-    axis = np.eye(3)[np.argmin(np.abs(rays), axis=1)]
-    first = np.cross(axis, rays)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(rays, first), rays], axis=2)
-
-
-def _upper(factors: Array) -> Array:
-    """(n, 2, 2) from the entries (0, 0), (0, 1), (1, 1) of (3, n)."""
-    out = np.zeros((factors.shape[1], 2, 2))
-    out[:, 0, 0], out[:, 0, 1], out[:, 1, 1] = factors
-    return out
-
-
 def _inverse_entries(N: list[Array]) -> list[Array]:
     """Entries xx, xy, xw, yy, yw, ww of the inverse of each symmetric 3 x 3 matrix."""
     a, b, c, d, e, f = N[:6]
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     det = a * A + b * B + c * C
     return [A / det, B / det, C / det, (a * f - c * c) / det, (b * c - a * e) / det, (a * d - b * b) / det]
-
-
-def _nearest_solution(equations: Array) -> Array:
-    """(n, 3) points whose (X, Y, Z, 1) solve equations (n, m, 4) best: smallest singular vectors."""
-    nowhere = ~np.isfinite(equations).all(axis=(1, 2))
-    equations[nowhere] = np.eye(equations.shape[1], 4)
-    last = np.linalg.svd(equations)[2][:, 3]
-    points = last[:, :3] / last[:, 3:]
-    points[nowhere] = np.nan
-    return np.asarray(points)
