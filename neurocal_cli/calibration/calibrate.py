@@ -221,7 +221,7 @@ def calibrate(
                 solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
             )
             _refuse_misfit(found)
-            warnings = _about_target(found, solution, choice)
+            warnings = _about_target(found, choice)
     except DegenerateGeometryError as error:
         explained = _explained(error, points, type)
         if explained == str(error):
@@ -333,14 +333,8 @@ def _lens_of(type: int, method: str, distortion: str, given: Camera | None) -> t
     return (Distortion(), distortion) if distortion in _FOUND else (Distortion(distortion), "")
 
 
-def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[str, ...]:
+def _about_target(found: Calibration, choice: str) -> tuple[str, ...]:
     """Warnings about a target that stays as given."""
-    if choice != "given" and solution.straight_lines is not None:
-        from neurocal_cli.calibration.target_choice import lines_that_are_bent
-
-        bent = lines_that_are_bent(solution, found.unit)
-        if bent:
-            return (bent,)
     if found.target is not None:
         return ()
     if choice in ("flat", "free"):

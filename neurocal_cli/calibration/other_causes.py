@@ -36,12 +36,11 @@ from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
 from neurocal_cli.calibration.point_errors import places_of_views, rms
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.effects import BENDS, bends, common
+from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds, pixel_spread
-from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.noise import stated_noise
-from neurocal_cli.calibration.verdict.rival import estimates
-from neurocal_cli.calibration.verdict.rivals import RIVALS
+from neurocal_cli.calibration.verdict.rival import causes_among
+from neurocal_cli.calibration.verdict.rivals import SHAPES
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import NeurocalError
@@ -60,11 +59,7 @@ _HOLDS = 2.0  # times the rms error of the other views
 _STARTS = 20
 _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
-_BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
-
-
-_BENT = replace(next(one for one in RIVALS if one.effect is bends), patterns=common)
 
 
 def has_other_cause(
@@ -170,7 +165,7 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     if not arrange(points).nearly_flat.all() or len(points) < 6:
         return otherwise
     limit, plain = _HOLDS * rmse_px, _posed(points, camera)
-    mistakes = list(_mistakes(points, camera))
+    mistakes = [(reason, error_of_view(changed, camera), scale) for reason, changed, scale in _mended(points)]
     if plain is None:
         return next((reason for reason, error, _ in mistakes if error < limit), otherwise)
     own = rms(plain)
@@ -186,11 +181,12 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     times = a[[0, 2]] / np.array(camera.entries)[[0, 2]]
     if abs(times[0] / times[1] - 1) < _ALIKE:
         how = f"it fits another zoom or focus: a focal length of {a[0]:.5g} px"
-        known.append((zoomed, odds(zoomed, 2), how + _or_bent(abs(times[0] - 1))))
+        known.append((zoomed, odds(zoomed, 2), how))
     how = f"it fits another camera or crop: the image centre ({b[3]:.0f}, {b[4]:.0f})"
-    shift = float(np.hypot(*(b[3:] - np.array(camera.entries)[3:])))
-    known.append((moved, odds(moved, 2), how + _or_bent(shift / camera.entries[0])))
-    least = LEVEL + max(odds(_rms_if_bent(plain), len(BENDS)), 0.0)
+    known.append((moved, odds(moved, 2), how))
+    shapes = causes_among(SHAPES, plain.problem, plain.state)
+    bent = own * float(np.sqrt(1.0 - max((one.explained for one in shapes), default=0.0)))
+    least = LEVEL + max(odds(bent, len(BENDS)), 0.0)
     likely = [(evidence, reason) for error, evidence, reason in known if error < limit and evidence > least]
     if likely:
         return max(likely)[1]
@@ -203,50 +199,30 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
 
 
-def _rms_if_bent(plain: Solution) -> float:
-    """Rms error [px] that a bend of the target leaves in one view, linearised; infinite without a board."""
-    problem = plain.problem
-    lin = linearised(problem.views, plain.state, problem.free_camera, True, (bends,), None, richer=False)
-    found = estimates(lin, lin.spare, (_BENT,), -np.inf)
-    return rms(plain) * float(np.sqrt(1.0 - found[0].explained)) if found else np.inf
-
-
-def _mistakes(points: Correspondences, camera: Camera) -> Iterator[tuple[str, float, float]]:
-    """Mistakes in a view's rows, the rms error without each, and the size of a given pixel in its pixels."""
-    for reason, changed in _other_points(points):
-        scale = float(np.sqrt(np.prod(np.ptp(changed.pixels, axis=0) / np.ptp(points.pixels, axis=0))))
-        scale = 1.0 if reason.startswith("its u and v") else scale
-        yield reason, error_of_view(changed, camera), scale
-
-
 def error_of_view(points: Correspondences, camera: Camera) -> float:
     """Rms error [px] of one view's points with their pose fitted; infinite if that fails."""
     posed = _posed(replace(points, covariance=None, across=None), camera)
     return np.inf if posed is None else rms(posed)
 
 
-def _or_bent(change: float) -> str:
-    """Another cause of a change of this size, over the focal length; "" if it is too large."""
-    return ", or the target is bent" if change < _BY_BENDING else ""
-
-
-def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondences]]:
-    """Hypotheses about errors in a view's rows, each with the rows corrected for it."""
+def _mended(points: Correspondences) -> Iterator[tuple[str, Correspondences, float]]:
+    """Mistakes in a view's rows, each with the rows mended, and the size of a given pixel in these."""
     pixels, world = points.pixels, points.world
-    yield "its u and v are exchanged", replace(points, pixels=pixels[:, ::-1])
+    yield "its u and v are exchanged", replace(points, pixels=pixels[:, ::-1]), 1.0
     if points.image_size is not None:
         yield (
             "its image is turned by 180 degrees against the others",
             replace(points, pixels=np.array(points.image_size) - 1 - pixels),
+            1.0,
         )
     for scale, name in ((2.0, "half"), (0.5, "twice")):
-        yield f"its image is of {name} the size", replace(points, pixels=(pixels + 0.5) * scale - 0.5)
+        yield f"its image is of {name} the size", replace(points, pixels=(pixels + 0.5) * scale - 0.5), scale
     for factors, name in (([2.0, 1.0], "u"), ([1.0, 2.0], "v")):
         stretched = replace(points, pixels=pixels * factors)
-        yield f"its {name} is of half resolution, as in interlaced images", stretched
+        yield f"its {name} is of half resolution, as in interlaced images", stretched, float(np.sqrt(2))
     for shift in (1, -1):
         shifted = replace(points, world=np.roll(world, shift, axis=0))
-        yield "its rows are shifted by one against its pixels", shifted
+        yield "its rows are shifted by one against its pixels", shifted, 1.0
 
 
 def _posed(points: Correspondences, camera: Camera) -> Solution | None:

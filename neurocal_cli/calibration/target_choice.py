@@ -42,8 +42,6 @@ from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_t
 from neurocal_cli.calibration.other_causes import contest_of, contradicts_sigma, has_other_cause
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
-from neurocal_cli.calibration.verdict.effects import bends
-from neurocal_cli.calibration.verdict.words import bend_of
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.network.options import Options
@@ -298,19 +296,6 @@ def _is_where_it_was(found: Found, again: Solution) -> bool:
     cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
     stays = bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
     return stays and np.array_equal(problem.free_camera, new.free_camera)
-
-
-def lines_that_are_bent(solution: Solution, unit: str) -> str:
-    """Warn that a bent board has biased a distortion found from straight lines; empty if it is not bent."""
-    held = contest_of(solution)
-    first = held.causes[0] if held is not None and held.causes else None
-    if held is None or first is None or first.rival.effect is not bends or first.pattern != "all":
-        return ""
-    return (
-        f"the target is bent by {bend_of(held.lin, first):.2g} {unit}; its lines are not straight, "
-        "which biases the distortion estimated from them; estimate it from the points instead (--distortion "
-        "auto)"
-    )
 
 
 def _with_bends(solution: Solution, common: Found | None) -> Found | None:

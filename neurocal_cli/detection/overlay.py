@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.detect import Detection, label
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
-from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.detection.identify import Located
 from neurocal_cli.detection.wide_lens import fit_wide_lens
 

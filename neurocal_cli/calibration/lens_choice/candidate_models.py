@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,9 +34,6 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import similar_states
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
-
-if TYPE_CHECKING:
-    from neurocal_cli.calibration.verdict.rival import Estimate, Rival
 
 # Repeated by test_model_selection.py (slow: 200 lenses of each of six models) and
 # test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
@@ -241,11 +237,15 @@ class _Chain:
         It starts from the first state if that is one.
         """
         from neurocal_cli.calibration.verdict.findings import LEVEL
+        from neurocal_cli.calibration.verdict.rival import causes_among
         from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 
         problem, views = supported(self.problem, "omnidir"), self.problem.views
         state = fisheye.adjusted.state
-        if problem is None or not any(one.evidence > LEVEL for one in _causes(fisheye, RICHER_LENSES)):
+        if problem is None:
+            return None
+        lacking = causes_among(RICHER_LENSES, fisheye.problem, state)
+        if not any(one.evidence > LEVEL for one in lacking):
             return None
         starts = [first]
         if first.model != "omnidir":
@@ -336,13 +336,15 @@ def falls_short(fitted: Iterable[Candidate]) -> bool:
 
     The reason must be another one than the shape of the target.
     """
+    from neurocal_cli.calibration.verdict.rival import causes_among
     from neurocal_cli.calibration.verdict.rivals import SHAPES
 
     best = min(fitted, key=lambda c: c.cost)
     least = _SHORT**2 * float(least_of_free_networks(best.adjusted.normal).sum()) + 1e-20
     if best.cost <= least:
         return False
-    return best.cost * (1.0 - max((one.explained for one in _causes(best, SHAPES)), default=0.0)) > least
+    shapes = causes_among(SHAPES, best.problem, best.adjusted.state)
+    return best.cost * (1.0 - max((one.explained for one in shapes), default=0.0)) > least
 
 
 def _is_decentred(omnidir: Candidate) -> bool:
@@ -353,20 +355,6 @@ def _is_decentred(omnidir: Candidate) -> bool:
         return False
     told = state.k[-2:] @ np.linalg.pinv(C, hermitian=True) @ state.k[-2:]
     return bool(told * worth(views, [omnidir]) > _DECENTRED * views.n_equations)
-
-
-def _causes(candidate: Candidate, rivals: tuple[Rival, ...]) -> list[Estimate]:
-    """The causes of its residuals among these, the most probable first."""
-    from neurocal_cli.calibration.verdict.linearised import linearised
-    from neurocal_cli.calibration.verdict.rival import estimates
-
-    problem, state, views = candidate.problem, candidate.adjusted.state, candidate.problem.views
-    effects = tuple(one.effect for one in rivals if one.effect is not None)
-    lin = linearised(views, state, problem.free_camera, problem.free_poses, effects, None)
-    try:
-        return estimates(lin, lin.spare, rivals)
-    except np.linalg.LinAlgError:
-        return []
 
 
 def worth(views: Views, fitted: Collection[Candidate]) -> float:

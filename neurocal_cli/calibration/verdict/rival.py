@@ -17,10 +17,12 @@ import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import least_by_precision, quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
+from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.calibration.verdict.findings import Limit, in_sequence
-from neurocal_cli.calibration.verdict.linearised import Effect, Linearised
+from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
 _ROUNDING = 1e-9
@@ -171,6 +173,16 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
             if one.evidence > (best[rival.cause].evidence if rival.cause in best else -np.inf):
                 best[rival.cause] = one
     return sorted(best.values(), key=lambda one: -one.evidence)
+
+
+def causes_among(rivals: tuple[Rival, ...], problem: Problem, state: CameraState) -> list[Estimate]:
+    """Those among some rivals at the minimum of a problem, as `estimates` has them; none if that fails."""
+    effects = tuple(one.effect for one in rivals if one.effect is not None)
+    lin = linearised(problem.views, state, problem.free_camera, problem.free_poses, effects, None)
+    try:
+        return estimates(lin, lin.spare, rivals)
+    except np.linalg.LinAlgError:
+        return []
 
 
 def including(lin: Linearised, found: Estimate) -> Linearised:

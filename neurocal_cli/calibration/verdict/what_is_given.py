@@ -36,15 +36,15 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.verdict.effects import stretch
 from neurocal_cli.calibration.verdict.findings import CONTRADICTION, EXPLAINED, LEVEL, Finding, log_odds
-from neurocal_cli.calibration.verdict.linearised import linearised
+from neurocal_cli.calibration.verdict.linearised import Board
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
-from neurocal_cli.calibration.verdict.rival import estimates
-from neurocal_cli.calibration.verdict.rivals import CHANGED, RIVALS, SAME
+from neurocal_cli.calibration.verdict.rival import causes_among
+from neurocal_cli.calibration.verdict.rivals import CHANGED, SAME, SHAPES
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.camera.pinhole import omega_of, product_of
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
@@ -205,7 +205,7 @@ def _linear(points: Correspondences, axes: tuple[int, int]) -> float | None:
     """The s of least residual; None if there is a camera for none."""
     pixels = (points.pixels - points.pixels.mean(axis=0)) / points.pixels.std()
     rows = [points.view_index == k for k in range(points.n_views)]
-    H = np.stack([homography(points.world[one][:, axes], pixels[one]) for one in rows])
+    H = np.concatenate([homographies(points.world[None, one][..., axes], pixels[None, one]) for one in rows])
     least, best = np.inf, None
     for s in np.exp(np.linspace(-np.log(_MOST), np.log(_MOST), _SCANNED)).tolist():
         h = H[..., :2] / [s, 1.0]
@@ -231,16 +231,12 @@ def _fitted(points: Correspondences, axis: int, s: float) -> Solution | None:
 
 def _refined(found: Solution, axes: tuple[int, int]) -> float:
     """By which factor the first axis is longer than the other one, as the residuals have it."""
-    (rival,) = (one for one in RIVALS if one.of_board and one.effect is stretch)
-    problem = found.problem
-    lin = linearised(
-        problem.views, found.state, problem.free_camera, True, (stretch,), problem.points.image_size, False
-    )
-    told = estimates(lin, lin.spare, (rival,))
-    if not told or lin.board is None:
+    stretched = causes_among(SHAPES[1:], found.problem, found.state)
+    board = Board.of(found.problem.views)
+    if not stretched or board is None:
         return 1.0
-    longer = float(np.exp(told[0].amounts[0]))  # positive beyond the linear range, too
-    return longer if lin.board.axes[axes[0], 0] else 1.0 / longer
+    longer = float(np.exp(stretched[0].amounts[0]))  # positive beyond the linear range, too
+    return longer if board.axes[axes[0], 0] else 1.0 / longer
 
 
 def _rms(solution: Solution) -> float:
@@ -248,19 +244,6 @@ def _rms(solution: Solution) -> float:
     points = solution.problem.points
     error = float(np.sqrt(solution.squared_error / len(points)))
     return error if error < float(points.pixels.std()) else np.inf
-
-
-def homography(plane: Array, pixels: Array) -> Array:
-    """Homography (3, 3) from points of a plane (n, 2) to pixels (n, 2)."""
-    middle, size = plane.mean(axis=0), plane.std(axis=0)
-    x = np.column_stack([(plane - middle) / size, np.ones(len(plane))])
-    zero = np.zeros_like(x)
-    rows = [np.hstack([x, zero, -pixels[:, :1] * x]), np.hstack([zero, x, -pixels[:, 1:] * x])]
-    H = np.linalg.svd(np.concatenate(rows), full_matrices=False)[2][-1].reshape(3, 3)
-    H *= -1.0 if H[2, 2] < 0 else 1.0  # the centre of the points lies in front of the camera
-    H[:, :2] /= size
-    H[:, 2] -= H[:, :2] @ middle
-    return H
 
 
 def _is_noise(solution: Solution) -> bool:
@@ -309,8 +292,6 @@ def _misfit(grid: Array, pixels: Array) -> float:
     if not (spread > 0 and (grid.std(axis=0) > 0).all()):
         return np.inf
     scaled = (pixels - pixels.mean(axis=0)) / spread
-    seen = np.column_stack([grid, np.ones(len(grid))]) @ homography(grid, scaled).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off = seen[:, :2] / seen[:, 2:] - scaled
-        rms = float(np.sqrt((off**2).sum(axis=1).mean()))
+    off = homography_at(homographies(grid[None], scaled[None]), grid[None])[0] - scaled
+    rms = float(np.sqrt((off**2).sum(axis=1).mean()))
     return rms if np.isfinite(rms) else np.inf

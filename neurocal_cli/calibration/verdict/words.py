@@ -10,8 +10,7 @@ from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
-from neurocal_cli.calibration.verdict.linearised import Linearised
-from neurocal_cli.calibration.verdict.rival import Estimate, Said, Say, Told
+from neurocal_cli.calibration.verdict.rival import Said, Say, Told
 from neurocal_cli.camera.geometry import Array
 
 NEAR = 0.02
@@ -152,15 +151,10 @@ def odd_view(told: Told) -> Said:
 
 def bent(told: Told) -> Said:
     """A common bend."""
-    return _on_board(told, f"bent by {bend_of(told.lin, told.found):.2g} {told.unit}")
-
-
-def bend_of(lin: Linearised, found: Estimate) -> float:
-    """Height [world unit] of a common bend between its highest and its lowest point."""
-    assert lin.board is not None
-    heights = zip(found.amounts, BENDS, strict=True)
-    terms = [(float(height), i, j) for height, (i, j) in heights]
-    return lin.board.bend(lambda x, y: np.sum([h * x**i * y**j for h, i, j in terms], axis=0))
+    assert told.lin.board is not None
+    terms = [(float(height), i, j) for height, (i, j) in zip(told.found.amounts, BENDS, strict=True)]
+    height = told.lin.board.bend(lambda x, y: np.sum([h * x**i * y**j for h, i, j in terms], axis=0))
+    return _on_board(told, f"bent by {height:.2g} {told.unit}")
 
 
 def stretched(told: Told) -> Said:

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import Index, Lattice, predict_vertices
 from neurocal_cli.detection.grid import TURNS
-from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.detection.medians import median, quantile
 
 # Insensitive; FOLDED and "two boards" in test_finding.py repeat this.

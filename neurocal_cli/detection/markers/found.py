@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
 from neurocal_cli.detection.grey import eight_bits, negative
-from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.detection.markers.lattice import find_vertices, place
 from neurocal_cli.detection.markers.locate import smallest
 from neurocal_cli.detection.markers.numbering import (

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies
 from neurocal_cli.detection.fitting.edge_profile import Real, profile
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Single
-from neurocal_cli.detection.homographies import homographies
 
 # sigma, beyond which a pattern changes the light by less than 0.0002 half contrasts, and beyond which the
 # inner part of a marker with a border does not matter

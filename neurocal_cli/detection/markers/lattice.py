@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.saddles import Image, interpolate, refine_saddles
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.detection.wide_lens import Flattening
 from neurocal_cli.observations.board import Plane

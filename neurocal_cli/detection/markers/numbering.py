@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.homographies import homographies, homography_at
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.markers.reading import Marks
 
 _NEAR = 4.5  # sides of a marker between neighbours

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
-from neurocal_cli.detection.homographies import homographies, homography_at
 from neurocal_cli.observations.markers import DICTIONARIES, code, code_count, correctable
 
 # Dictionaries that may be meant when none is named, those in use most first. The smaller ones of a size are
