@@ -16,12 +16,11 @@ from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import outline_of
-from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, drawing, panels_in_rows, plain, style
 from neurocal_cli.commands.show.text import attributes, printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _ACROSS = ("far left", "left", "middle", "right", "far right")
 _DOWN = ("very top", "top", "middle", "bottom", "very bottom")
@@ -150,13 +149,12 @@ def draw_views(
     columns = min(2, len(views))
     rows = -(-len(views) // columns)
     squares, rim = board_of(calibration)
-
-    def draw(made: Figure) -> None:
-        places = made.subplots(rows, columns, squeeze=False).ravel()
+    each = 3.1 if columns > 1 else 5.0
+    size = columns * each, rows * (each * height / width + 0.25) + 0.3
+    with drawing(size, 0.05, kind) as (figure, file):
         pixels = calibration.points.pixels[:: max(1, len(calibration.points) // _MOST_DOTS)]
-        for axes in places[len(views) :]:
-            axes.set_axis_off()
-        for number, (axes, (view, text)) in enumerate(zip(places, views, strict=False), start=1):
+        places = panels_in_rows(figure, len(views), columns)
+        for number, (axes, (view, text)) in enumerate(zip(places, views, strict=True), start=1):
             axes.plot(*pixels.T, ".", color="0.8", markersize=2)
             _draw_view(axes, view, calibration, squares, rim)
             style(axes, f"{number}: {text}")
@@ -164,10 +162,8 @@ def draw_views(
             axes.set(
                 xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xticks=[], yticks=[]
             )
-        made.suptitle(title)
-
-    each = 3.1 if columns > 1 else 5.0
-    return picture(draw, (columns * each, rows * (each * height / width + 0.25) + 0.3), 0.05, kind)
+        figure.suptitle(title)
+    return file.getvalue()
 
 
 def board_of(calibration: Calibration) -> tuple[Array, Array]:

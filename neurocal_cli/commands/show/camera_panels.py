@@ -20,7 +20,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, picture, plain, say, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, drawing, plain, say, style
 from neurocal_cli.commands.show.text import round_down
 from neurocal_cli.observations.board import planes_are_named
 from neurocal_cli.observations.points import Correspondences
@@ -28,7 +28,6 @@ from neurocal_cli.observations.target import Target
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_ARROWS = 500  # more arrows cannot be distinguished
 _MANY_DOTS = 2000  # more dots overlap, and make a large .svg file
@@ -351,14 +350,12 @@ def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
 def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
     """Draw the estimated points of each plane: height as contours, offsets in the plane as arrows."""
     planes = int(target.plane.max()) + 1
-
-    def draw(figure: Figure) -> None:
+    with drawing((_WIDTH, 2 * planes * _HEIGHT), 0.12, kind) as (figure, file):
         panels = figure.subplots(2 * planes, 1)
         for plane in range(planes):
             _draw_plane(target, plane, unit, *panels[2 * plane : 2 * plane + 2])
         figure.suptitle(f"The target as it was found, std {np.sqrt((target.std**2).mean()):.2g} {unit}")
-
-    return picture(draw, (_WIDTH, 2 * planes * _HEIGHT), 0.12, kind)
+    return file.getvalue()
 
 
 def in_plane(target: Target, plane: int) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from neurocal_cli.calibration.drift import SHARE, Drift
 from neurocal_cli.calibration.rig.rig_drift import RigDrift
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.figure import ACCENT, colour_bar, picture, plain, style
+from neurocal_cli.commands.show.figure import ACCENT, colour_bar, drawing, plain, style
 from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
@@ -26,7 +26,6 @@ from neurocal_cli.commands.show.text import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from neurocal_cli.camera.camera import Camera
 
@@ -198,39 +197,41 @@ def draw_drift(
 
     The cameras have names, and the sizes of their images; a single one may have the name "".
     """
-
-    def draw(figure: Figure) -> None:
+    with drawing((5.2 * len(drifts), 7.6), 0.1, kind) as (figure, file):
         panels = figure.subplots(2, len(drifts), squeeze=False)
         for pair, (name, (drift, size)) in zip(panels.T, drifts.items(), strict=True):
-            draw_one(pair, name, drift, size)
+            head = f"{plain(name)}\n" if name else ""
+            _draw_pixels(pair[0], head, drift, size)
+            _draw_ratios(pair[1], head, drift, limit)
+            for axes in pair:
+                axes.grid(False)
+                axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal")
+                axes.set(xlabel="u [px]", ylabel="v [px]")
+    return file.getvalue()
 
-    def draw_one(pair: Sequence[Axes], name: str, drift: Drift, size: tuple[int, int]) -> None:
-        length, ratio = drift.length, drift.length / np.maximum(drift.std, 1e-300)
-        first, second = pair
-        _map(first, drift, length, "px")
-        longest = float(length.max(initial=1e-300))
-        enlarged = _LONGEST * size[0] / longest
-        u, v = np.unique(drift.pixels[:, 0]), np.unique(drift.pixels[:, 1])
-        step = max(1, round(len(u) / _ARROWS))
-        some = np.isin(drift.pixels[:, 0], u[::step]) & np.isin(drift.pixels[:, 1], v[::step])
-        first.quiver(
-            *drift.pixels[some].T, *drift.difference[some].T,
-            color="white", angles="xy", scale_units="xy", scale=1 / enlarged, width=0.005,
-        )  # fmt: skip
-        head = f"{plain(name)}\n" if name else ""
-        style(first, f"{head}New minus old pixel of a ray, {enlarged:,.2g} times enlarged")
-        first.grid(False)
-        _map(second, drift, ratio, "standard deviations")
-        second.tricontour(drift.pixels[:, 0], drift.pixels[:, 1], ratio, levels=[_STRONG], colors=ACCENT)
-        second.plot(*drift.pixels[drift.worst], "o", color=ACCENT, fillstyle="none", markersize=10)
-        word = "different" if drift.share < limit else "the same"
-        style(second, f"{head}In std of both: {word} (line: {_STRONG:g}, circle: most)")
-        second.grid(False)
-        for axes in (first, second):
-            axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal")
-            axes.set(xlabel="u [px]", ylabel="v [px]")
 
-    return picture(draw, (5.2 * len(drifts), 7.6), 0.1, kind)
+def _draw_pixels(axes: Axes, head: str, drift: Drift, size: tuple[int, int]) -> None:
+    """Draw the differences in pixels, and their directions as arrows."""
+    _map(axes, drift, drift.length, "px")
+    enlarged = _LONGEST * size[0] / float(drift.length.max(initial=1e-300))
+    u, v = np.unique(drift.pixels[:, 0]), np.unique(drift.pixels[:, 1])
+    step = max(1, round(len(u) / _ARROWS))
+    some = np.isin(drift.pixels[:, 0], u[::step]) & np.isin(drift.pixels[:, 1], v[::step])
+    axes.quiver(
+        *drift.pixels[some].T, *drift.difference[some].T,
+        color="white", angles="xy", scale_units="xy", scale=1 / enlarged, width=0.005,
+    )  # fmt: skip
+    style(axes, f"{head}New minus old pixel of a ray, {enlarged:,.2g} times enlarged")
+
+
+def _draw_ratios(axes: Axes, head: str, drift: Drift, limit: float) -> None:
+    """Draw the differences in standard deviations, and where they are strong and largest."""
+    ratio = drift.length / np.maximum(drift.std, 1e-300)
+    _map(axes, drift, ratio, "standard deviations")
+    axes.tricontour(drift.pixels[:, 0], drift.pixels[:, 1], ratio, levels=[_STRONG], colors=ACCENT)
+    axes.plot(*drift.pixels[drift.worst], "o", color=ACCENT, fillstyle="none", markersize=10)
+    word = "different" if drift.share < limit else "the same"
+    style(axes, f"{head}In std of both: {word} (line: {_STRONG:g}, circle: most)")
 
 
 def _map(axes: Axes, drift: Drift, values: Array, unit: str) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +29,9 @@ def check_available() -> None:
         ) from error
 
 
-def picture(draw: Callable[[Figure], None], size: tuple[float, float], pad: float, kind: str) -> bytes:
-    """Draw a figure with a size and padding of panels [inches], and return the bytes of the file."""
+@contextmanager
+def drawing(size: tuple[float, float], pad: float, kind: str) -> Iterator[tuple[Figure, BytesIO]]:
+    """A figure with a size and padding of panels [inches], and its file, which is written at the end."""
     check_available()
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -40,12 +42,19 @@ def picture(draw: Callable[[Figure], None], size: tuple[float, float], pad: floa
         figure = Figure(figsize=size)
         figure.set_layout_engine("constrained", w_pad=pad, h_pad=pad)
         FigureCanvasAgg(figure)
-        draw(figure)
-        buffer = BytesIO()
+        file = BytesIO()
+        yield figure, file
         # Without a date, the same plot gives the same file.
         undated = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
-        figure.savefig(buffer, format=kind, dpi=120, metadata=undated[kind])
-    return buffer.getvalue()
+        figure.savefig(file, format=kind, dpi=120, metadata=undated[kind])
+
+
+def panels_in_rows(figure: Figure, count: int, columns: int) -> list[Axes]:
+    """So many panels in rows; places that are left are empty."""
+    panels = figure.subplots(-(-count // columns), columns, squeeze=False).ravel()
+    for unused in panels[count:]:
+        unused.set_axis_off()
+    return list(panels[:count])
 
 
 def plain(text: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.show.figure import ACCENT, picture, style
+from neurocal_cli.commands.show.figure import ACCENT, drawing, style
 from neurocal_cli.commands.show.text import (
     Table,
     align,
@@ -29,7 +29,6 @@ from neurocal_cli.simulation.starts import RateStudy, StartStudy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
 # The errors in the paper's Table 1, calibrated minus true.
@@ -340,15 +339,13 @@ def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kin
 
     `unit` is that of the world coordinates, and `kind` png, pdf or svg.
     """
-
-    def draw(figure: Figure) -> None:
+    with drawing((6.6, 6.0 if starts is None else 9.0), 0.1, kind) as (figure, file):
         grid = figure.add_gridspec(2 if starts is None else 3, 2)
         for n, name in enumerate(FIG_1):
             _draw_errors(figure.add_subplot(grid[n // 2, n % 2]), study, name, _UNITS.get(name, unit), n == 0)
         if starts is not None:
             _draw_starts(figure.add_subplot(grid[2, :]), starts)
-
-    return picture(draw, (6.6, 6.0 if starts is None else 9.0), 0.1, kind)
+    return file.getvalue()
 
 
 def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bool) -> None:
@@ -410,8 +407,7 @@ def _draw_starts(axes: Axes, starts: StartStudy) -> None:
 
 def draw_rates(study: RateStudy, kind: str = "png") -> bytes:
     """Draw, for each pair of rates, on how many data sets a start converges, and how fast."""
-
-    def draw(figure: Figure) -> None:
+    with drawing((5.6, 8.0), 0.12, kind) as (figure, file):
         upper, lower = figure.subplots(2, 1)
         share = 100 * study.converged / study.sets
         labels = [[str(count) for count in row] for row in study.converged]
@@ -422,8 +418,7 @@ def draw_rates(study: RateStudy, kind: str = "png") -> bytes:
         limits = float(np.nanmin(known)), float(np.nanmax(known))
         _draw_grid(lower, study, known, texts, limits, dark_is_low=False)
         lower.set_title("Median epochs of these", loc="left")
-
-    return picture(draw, (5.6, 8.0), 0.12, kind)
+    return file.getvalue()
 
 
 def _draw_grid(

@@ -19,12 +19,11 @@ from neurocal_cli.commands.show.camera_panels import (
     panels_of,
     targets_of,
 )
-from neurocal_cli.commands.show.figure import ACCENT, INK, entitle, picture, plain, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, drawing, entitle, plain, style
 from neurocal_cli.errors import plural
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _CELLS = 6  # across and down, as in the verdict
 _MOST_NUMBERS = 14  # cameras with room for a number in each cell
@@ -235,8 +234,7 @@ def _page(
     kind: str,
 ) -> bytes:
     """Draw rows of panels on one page."""
-
-    def draw(figure: Figure) -> None:
+    with drawing(size, _PAD, kind) as (figure, file):
         axes = figure.subplot_mosaic(
             rows,  # type: ignore[arg-type]
             height_ratios=list(heights),
@@ -245,14 +243,15 @@ def _page(
         for name, place in axes.items():
             panels[name](place)
         figure.suptitle(title)
-
-    return picture(draw, size, _PAD, kind)
+    return file.getvalue()
 
 
 def _alone(name: str, draw: Draw, kind: str) -> bytes:
     """Draw a single panel."""
     how = {"projection": "3d"} if name == "poses" else {}
-    return picture(lambda figure: draw(figure.add_subplot(**how)), _PANEL, _PAD, kind)
+    with drawing(_PANEL, _PAD, kind) as (figure, file):
+        draw(figure.add_subplot(**how))
+    return file.getvalue()
 
 
 def _draw_cloud(axes: Axes, errors: Array, name: str, unit: str) -> None:

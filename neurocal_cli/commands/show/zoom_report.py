@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from neurocal_cli.calibration.zoom.settings import CONTROLS
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_report import target_json, target_lines
-from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, picture, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, drawing, panels_in_rows, style
 from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
@@ -182,8 +184,7 @@ def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
     NeurocalError
         matplotlib is not installed.
     """
-
-    def draw(figure: Figure, panels: list[Axes]) -> None:
+    with _drawing(len(lens.names) + (not lens.known), kind) as (figure, panels, file):
         for j, name in enumerate(lens.names):
             _draw_parameter(panels[j], lens, j, name)
         title = f"{len(lens.settings)} settings, bands of two standard deviations"
@@ -191,34 +192,26 @@ def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
             _draw_errors(panels[-1], lens.controls, lens.settings, lens.rmse, "Error at the settings")
             title += f", rms {lens.rmse_px:.4g} px"
         figure.suptitle(title)
-
-    return _picture(draw, len(lens.names) + (not lens.known), kind)
+    return file.getvalue()
 
 
 def draw_evaluation(evaluation: LensEvaluation, controls: tuple[str, ...], kind: str = "png") -> bytes:
     """Draw the error over the settings, and the errors of the lens and of the baselines."""
-
-    def draw(figure: Figure, panels: list[Axes]) -> None:
+    with _drawing(2, kind) as (_, panels, file):
         settings = np.array([[s.values[name] for name in controls] for s in evaluation.settings])
         values = np.array([s.rmse_px for s in evaluation.settings])
         _draw_errors(panels[0], controls, settings, values, "Error of the networks")
         _draw_baselines(panels[1], evaluation)
+    return file.getvalue()
 
-    return _picture(draw, 2, kind)
 
-
-def _picture(draw: Callable[[Figure, list[Axes]], None], count: int, kind: str) -> bytes:
-    """A figure of some panels, two in a row."""
+@contextmanager
+def _drawing(count: int, kind: str) -> Iterator[tuple[Figure, list[Axes], BytesIO]]:
+    """A figure, its panels, two in a row, and its file."""
     columns = min(_COLUMNS, count)
-    rows = -(-count // columns)
-
-    def draw_panels(figure: Figure) -> None:
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        for unused in panels[count:]:
-            unused.set_axis_off()
-        draw(figure, list(panels[:count]))
-
-    return picture(draw_panels, (_PANEL[0] * columns, _PANEL[1] * rows + 0.4), 0.1, kind)
+    size = _PANEL[0] * columns, _PANEL[1] * -(-count // columns) + 0.4
+    with drawing(size, 0.1, kind) as (figure, file):
+        yield figure, panels_in_rows(figure, count, columns), file
 
 
 def _slices(lens: ZoomLens) -> list[tuple[float | None, NDArray[np.intp]]]:
