@@ -19,8 +19,9 @@ is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
 def plain(name: str) -> str:
-    """A name in lower-case letters and digits."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+    """A name in lower-case letters and digits, spelt rightly."""
+    letters = re.sub(r"[^a-z0-9]", "", name.lower())
+    return letters.replace("distors", "distort").replace("coefficent", "coefficient")
 
 
 class Field:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.files.tree_fields import is_number
+from neurocal_cli.files.tree_fields import is_number, plain
 
 # The keys of a camera as they are written here, by ROS and by OpenCV, and how else people call them.
 _OTHERS = {
@@ -47,7 +47,7 @@ _OTHERS = {
         "distortioncoef distortioncoefficient distcoefficients distortion distortions dist d kc coefs "
         "coeffs coef coefficients distortionparameters distortionparams distparams distortionvector "
         "distortionmatrix distvec lensdistortion cameradistortion distmtx distmatrix camdist disto distcof "
-        "distcoffs distortioncoefficents distortionvalues opencvdistortion d1 cameradistcoeffs "
+        "distcoffs distortionvalues opencvdistortion d1 cameradistcoeffs "
         "camdistcoeffs cameradistcoeff camdistcoeff cameradistortioncoefficients "
         "lensdistortioncoefficients distortioncoeficients distcoefficient"
     ),
@@ -110,12 +110,6 @@ _MOST_OF_ONE = 6  # coefficients of one kind
 _LONG = 40  # characters of a text that may hold packed numbers
 
 
-def plain(name: str) -> str:
-    """A name in lower-case letters and digits, spelt rightly."""
-    letters = re.sub(r"[^a-z0-9]", "", name.lower())
-    return letters.replace("distors", "distort").replace("coefficent", "coefficient")
-
-
 NAMES = {key: (plain(key), *others.split()) for key, others in _OTHERS.items()}
 PARAMETERS = (*NAMES["camera_matrix"], *_PARAMETERS.split())
 
@@ -139,15 +133,9 @@ def is_numbers(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _count(value: Any) -> int:
-    if isinstance(value, dict):
-        return _count(value.get("data", []))
-    return sum(map(_count, value)) if isinstance(value, (list, tuple)) else 1
-
-
 def is_matrix(value: Any) -> bool:
     """Whether these are nine numbers in any form."""
-    return not isinstance(value, (int, float, str)) and is_numbers(value) and _count(value) == 9
+    return not isinstance(value, (int, float, str)) and is_numbers(value) and len(flat(value)) == 9
 
 
 def is_four(value: Any) -> bool:

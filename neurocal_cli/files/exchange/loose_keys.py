@@ -36,10 +36,9 @@ from neurocal_cli.files.exchange.camera_names import (
     may_be_distortion,
     means,
     parameters_apart,
-    plain,
 )
 from neurocal_cli.files.exchange.document import NoCameraError, camera_matrix
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.tree_fields import Field, plain
 
 _ROUNDED = 1e-3  # share of the focal length by which two statements of it differ at most
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
