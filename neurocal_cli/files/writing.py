@@ -151,13 +151,8 @@ def _write_stdout(data: bytes) -> None:
 def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outputs]:
     """Hold back all outputs until the end of the block, and discard them if it fails.
 
-    An exception of one of the types `finishing` ends the block successfully. A nested block is a part of the
-    outer one.
+    An exception of one of the types `finishing` ends the block successfully.
     """
-    outer = _CURRENT.get()
-    if outer is not None:
-        yield outer
-        return
     outputs = Outputs()
     token = _CURRENT.set(outputs)
     try:

@@ -153,7 +153,7 @@ def _multical_parts(document: Document) -> dict[str, Field]:
 
 MULTICAL = Format(
     "multical",
-    "K:matrix",
+    "K",
     """
     standard: tilted dist
     fisheye: fisheye dist
@@ -181,7 +181,7 @@ def _mc_calib_parts(document: Document) -> dict[str, Field]:
 
 MC_CALIB = Format(
     "MC-Calib",
-    "camera_matrix:data",
+    "camera_matrix",
     """
     0: plumb_bob distortion_vector
     1: fisheye distortion_vector

@@ -242,7 +242,7 @@ class CameraKeys:
         if self.size:
             _put_all(tree, listed(self.size), camera.image_size or (0, 0))
         paths = lens.intrinsics or listed(self.intrinsics)
-        if ":" in paths[0] and not paths[0].endswith((":list", ":column")):
+        if ":" in paths[0] and not paths[0].endswith(":list"):
             put(tree, paths[0], matrix_of(a, b, u0, v0, skew))
         else:
             _put_all(tree, paths, [a, b, u0, v0])

@@ -39,8 +39,6 @@ class CameraSet:
     crop_factor: float | None = None  # diagonal of a 35 mm film by that of the sensor, likewise
 
     def __post_init__(self) -> None:
-        if not self.cameras:
-            raise InputError("holds no camera; give another file")
         if len(self.relative) != len(self.cameras) - 1:
             raise InputError(
                 f"holds {len(self.cameras)} cameras, but not their relative poses; give a file with "

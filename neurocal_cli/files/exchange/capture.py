@@ -112,7 +112,7 @@ def _easymocap_parts(document: Document) -> dict[str, Tree]:
 
 EASYMOCAP = Format(
     "EasyMocap",
-    "K:data",
+    "K",
     """
     : plumb_bob dist
     fisheye: fisheye dist

@@ -35,7 +35,7 @@ def _kitti_parts(document: Document) -> dict[str, Tree]:
 
 KITTI = Format(
     "KITTI",
-    "K:matrix",
+    "K",
     "plumb_bob D",
     size="S",
     told=lambda document: "\nK_0" in document.text[:20_000] or document.text.startswith("P0:"),

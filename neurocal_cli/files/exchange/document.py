@@ -265,7 +265,7 @@ def _named(tree: dict[str, Any]) -> dict[str, Any]:
     if not all(re.fullmatch(r"arr_\d+", name) for name in tree):
         return tree
     matrices = [name for name, rows in tree.items() if camera_matrix(rows) is not None]
-    rows = [np.ravel(value).tolist() for value in tree.values() if np.size(value) in (4, 5, 8, 12, 14)]
+    rows = [np.ravel(value).tolist() for value in tree.values() if np.size(value) in _COEFFICIENTS]
     if len(matrices) != 1 or len(rows) > 1:
         return tree
     return {"K": tree[matrices[0]], **({"D": rows[0]} if rows else {})}

@@ -203,10 +203,10 @@ OKVIS = Format(
 )
 SVO = Format(
     "SVO",
-    "camera/intrinsics:column",
+    "camera/intrinsics",
     """
-    radial-tangential: k1k2p1p2 camera/distortion/parameters:column
-    equidistant: fisheye camera/distortion/parameters:column
+    radial-tangential: k1k2p1p2 camera/distortion/parameters
+    equidistant: fisheye camera/distortion/parameters
     none: none
     """,
     model="camera/distortion/type",

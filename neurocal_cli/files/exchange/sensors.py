@@ -138,7 +138,7 @@ def _oak_poses(parts: Mapping[str, Field]) -> list[Pose | None]:
 
 OAK = Format(
     "OAK",
-    "intrinsicMatrix:matrix",
+    "intrinsicMatrix",
     """
     0: tilted distortionCoeff
     1: fisheye distortionCoeff

@@ -2,8 +2,8 @@
 
 A path is a chain of keys joined by ``/``; numbers index lists. A path of several numbers is that of a list or
 a matrix in any form, or ends in the keys of each, joined by commas. The form in which it is written follows a
-colon: ``list``, ``matrix`` of nested rows, ``data`` in ``{rows, cols, data}``, ``column`` of such data; by
-columns are ``transposed``, a nested matrix, and ``columns``, one list, and so they are read.
+colon: ``list``, ``matrix`` of nested rows; by columns are ``transposed``, a nested matrix, and ``columns``,
+one list, and so they are read.
 """
 
 from __future__ import annotations
@@ -90,10 +90,7 @@ def put(tree: dict[str, Any], path: str, value: Any) -> None:
     for folder, key in zip(folders, path.split("/")[1:], strict=True):
         here = here.setdefault(folder, [] if key.isdecimal() else {})
     value = np.transpose(value) if form in _BY_COLUMNS else value
-    if form in ("data", "column"):
-        matrix = np.atleast_2d(value) if form == "data" else np.reshape(value, (-1, 1))
-        value = {"rows": matrix.shape[0], "cols": matrix.shape[1], "data": matrix.ravel().tolist()}
-    elif isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray):
         value = (value.ravel() if form in ("list", "columns") else value).tolist()
     if isinstance(here, list):
         here += [0.0] * (int(last) + 1 - len(here))
@@ -166,19 +163,12 @@ def _yaml_lines(tree: Mapping[str, Any]) -> list[str]:
     for key, value in tree.items():
         if isinstance(value, dict):
             lines += [f"{key}:", *(f"   {line}" for line in _yaml_lines(value))]
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            lines.append(f"{key}:")
-            for entry in value:
-                first, *rest = _yaml_lines(entry)
-                lines += [f" - {first}", *(f"   {line}" for line in rest)]
         else:
             lines.append(f"{key}: {_yaml_value(value)}")
     return lines
 
 
 def _yaml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if isinstance(value, (int, str)):
         return str(value) if isinstance(value, int) else text(value)
     if isinstance(value, list) and all(isinstance(entry, int) for entry in value):
