@@ -241,12 +241,8 @@ def _jpeg(data: Data, whole: bool) -> Header:
 
 
 def _bmp(data: Data, whole: bool) -> Header:
-    (start, size) = struct.unpack_from("<II", data, 10)
-    if size == 12:
-        width, height, _, depth = struct.unpack_from("<HHHH", data, 18)
-        packing = 0
-    else:
-        width, height, _, depth, packing = struct.unpack_from("<iiHHI", data, 18)
+    (start,) = struct.unpack_from("<I", data, 10)
+    width, height, _, depth, packing = struct.unpack_from("<iiHHI", data, 18)
     if packing in (0, 3) and start + (width * depth + 31) // 32 * 4 * abs(height) > len(data):
         raise _TruncatedError
     return Header("BMP", width, abs(height))

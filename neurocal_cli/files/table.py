@@ -169,13 +169,7 @@ def _is_plain(data: bytes, schema: Schema, layout: Layout) -> bool:
     if separator is None:
         return True
     if data.find(b" ", layout.offset) >= 0 and any(name in schema.labels for name in layout.names):
-        # NumPy would keep the blanks around labels.
-        mark = separator.encode()
-        blanks = (mark + b" ", b" " + mark, b"\n ", b" \n")
-        if any(data.find(blank, before) >= 0 for blank in blanks) or data.endswith(b" "):
-            return False
-        if data[layout.offset : layout.offset + 1] == b" ":
-            return False
+        return False  # NumPy would keep the blanks around labels
     return separator == "\t" or data.find(b"\t", layout.offset) < 0
 
 
