@@ -62,12 +62,7 @@ _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _NOT_YET = 5.0  # log evidence that another step may add; without it, 56 sets of all shapes end the same
 _SETTLED = 0.02  # of the cameras' standard deviations
-# Largest offset over the target's size, of one plane and of planes that are set up by hand; more is another
-# target.
-_LARGEST, _LARGEST_OF_FOLDED = 0.02, 0.05
-# Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
-# estimated target below the first limit may move slightly beyond it when the lens is selected again.
-_STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
+_LARGEST = 0.05  # largest offset over the target's size; more is another target
 _LEANING = 0.03  # rad; largest lean, of which upright boards leave much open: 0.02 on one in photographs
 _FEWEST, _FEWEST_OF_FOLDED = 3, 1  # fewest different views of most points
 LEAST_GAIN = 6.0
@@ -216,7 +211,6 @@ class Search:
         self.fits, self.flat = list(fits), flat
         self.still = still or (known is not None and known.only_bends)
         all_points = [problem.points for problem, _ in fits]
-        self.most_stretched = _STRETCHED if known is None else _STRETCHED_AGAIN
         if known is None:
             self.given, label, self.ids = distinct_points(all_points)
             self.plane = planes_of(self.given, self.ids)
@@ -227,7 +221,7 @@ class Search:
             self.sizes = dict(known.sizes)
         self.label = np.split(label, np.cumsum([len(points) for points in all_points])[:-1])
         self.prior = prior_of(self.given, self.plane)
-        self.largest = (_LARGEST_OF_FOLDED if self.plane.any() else _LARGEST) * self.prior.size
+        self.largest = _LARGEST * self.prior.size
         # Errors of points that are seen once look like noise.
         self.absent = (OUT_OF_PLANE if flat else ()) + (SINGLE if _median_views(label) < 2 else ())
         found = np.zeros_like(self.given) if known is None else known.offsets
@@ -332,8 +326,7 @@ class Search:
             self.given, self._common(), std, self.plane, found.sizes, self.flat, found.evidence - given,
             self.ids, bends=bends,
         )  # fmt: skip
-        stretch, lean = target.sides()
-        if not (max(stretch, target.unequal()) < self.most_stretched and lean < _LEANING):
+        if not target.sides()[1] < _LEANING:
             return None
         return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
 

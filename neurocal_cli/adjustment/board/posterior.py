@@ -116,7 +116,9 @@ _LEAST_SHARE = 1e-9  # of its prior variance that a coefficient keeps
 # Without it, a stretch and a lean may explain one view of two planes, and the centre is off by eight standard
 # deviations (test_folded_targets.py, slow).
 _BY_HAND = 5e-4
-_MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
+# Largest sizes over the target's size. A wrong description stretches by percents; a skew of the image axes
+# looks like a lean.
+_MOST = {"stretch": 3e-2, "lean": 2e-3}
 # Least predicted gain in log evidence of a step. With these, cameras differ by 0.002 standard deviations rms
 # from those with 1e-5; 207 sets of boards of all shapes by tests/support/targets.py.
 _NO_GAIN = 0.002
@@ -301,7 +303,8 @@ class _Climb:
             self.least[self.names.index("fold")] = _BY_HAND * prior.size
         self.most = np.where(held, self.least, prior.size)
         self.switched = [self.names.index(name) for name in _SWITCHED if name in self.names]
-        self.of_prints, self.most_of_prints = STRETCH * prior.size, _MOST * prior.size
+        self.of_prints = STRETCH * prior.size
+        self.most_of_prints = [_MOST.get(name, 0.0) * prior.size for name in self.names]
 
     def allowed(self, ratios: Array, noise: float) -> Array:
         """Ratios in the range of each part; stretch and lean have the least size of prints."""
@@ -325,7 +328,7 @@ class _Climb:
         least, most = self.least.copy(), self.most.copy()
         for k in self.switched:
             on = self.is_on(now, k)
-            least[k], most[k] = (self.of_prints, self.most_of_prints) if on else (least[k], least[k])
+            least[k], most[k] = (self.of_prints, self.most_of_prints[k]) if on else (least[k], least[k])
         return least / math.sqrt(now.variance), most / math.sqrt(now.variance)
 
     def is_on(self, now: _Solution, part: int) -> bool:

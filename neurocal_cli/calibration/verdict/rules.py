@@ -318,8 +318,15 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
-    """Findings about an estimated flat target that differs from its description as no print does."""
+    """Findings about an estimated target that differs from its description as no print does."""
+    measure = "measure the target along both sides, and give its true size"
     if target.plane.any() or not is_flat(target.given):
+        off = max(target.sides()[0], target.unequal())
+        yield (
+            STRETCHED_PRINT.grade(off),
+            f"the sides of the target's planes are {100 * off:.2g} % off its description: {WRONG_PRINT}",
+            measure,
+        )
         return
     from neurocal_cli.adjustment.open_choices import stretches
 
@@ -335,10 +342,9 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
             "than those of prints, so theta may be wrong by more than its std",
             "measure the target, turn it by 90 degrees in some views, or give --no-skew",
         )
-    measure = "measure the target along both sides, and give its true size"
     yield (
         STRETCHED_PRINT.grade(abs(stretch)),
-        f"the target is {100 * abs(stretch):.2g} % longer along {longer}, compared with {other}, "
+        f"the target is {100 * np.expm1(abs(stretch)):.2g} % longer along {longer}, compared with {other}, "
         f"than described: {WRONG_PRINT}",
         measure,
     )

@@ -165,7 +165,8 @@ def proportions(points: Correspondences) -> Proportions | None:
     found = _fitted(points, axes[0], s)
     if found is None or abs(np.log(s)) < _AWAY or not _is_noise(found):
         return None
-    given = _fitted(points, axes[0], 1.0)
+    # Boards that hardly differ in tilt may determine a camera only without skew.
+    given = _fitted(points, axes[0], 1.0) or _fitted(points, axes[0], 1.0, skew=False)
     rms, given_px = (np.inf if one is None else _rms(one) for one in (found, given))
     if not rms**2 < (1.0 - EXPLAINED) * given_px**2:
         return None
@@ -218,12 +219,13 @@ def _linear(points: Correspondences, axes: tuple[int, int]) -> float | None:
     return best
 
 
-def _fitted(points: Correspondences, axis: int, s: float) -> Solution | None:
-    """The camera for points with an axis multiplied by s; None if there is none."""
+def _fitted(points: Correspondences, axis: int, s: float, skew: bool = True) -> Solution | None:
+    """The camera for points with an axis multiplied by s, with or without skew; None if there is none."""
     world = points.world.copy()
     world[:, axis] *= s
     try:
-        problem = problem_for(replace(points, world=world), 1, distortion=Distortion("k1k2"))
+        points = replace(points, world=world)
+        problem = problem_for(points, 1, skew=skew, distortion=Distortion("k1k2"))
         return fit(problem, options_for("lm", _STARTS, 0))
     except NeurocalError:
         return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.distorted import SIGMA, bent_set, through
+from support.real_data import RealFiles
 from support.scenes import random_flat_set
 from support.slow_cases import slow_but
 from support.wrong_inputs import (
@@ -23,7 +24,7 @@ from support.wrong_inputs import (
     turned_poses,
 )
 
-from neurocal_cli import Correspondences, Pose, calibrate
+from neurocal_cli import Correspondences, Pose, calibrate, read_points
 from neurocal_cli.calibration.verdict.what_is_given import proportions
 from neurocal_cli.camera.distortion import distort
 from neurocal_cli.errors import DegenerateGeometryError
@@ -163,3 +164,11 @@ def test_a_lens_far_from_k1k2_leaves_no_negative_proportions() -> None:
     scene, _ = bent_set("fisheye", 35)
     points = scene.points(SIGMA, np.random.default_rng([35, 1]))
     assert proportions(points) is None
+
+
+def test_boards_that_hardly_differ_in_tilt_have_no_other_proportions(real_files: RealFiles) -> None:
+    """The points as given fit a camera without skew just as well."""
+    points = read_points(real_files("field_reports/smallrig2000_r.csv")[0])
+    assert proportions(points) is None
+    with pytest.raises(DegenerateGeometryError, match="parallel within the noise"):
+        calibrate(points)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.campaign import scene
-from support.grouped_views import ALPHA, board, photographed, poses, rescaled
+from support.grouped_views import ALPHA, CAMERA, board, photographed, poses, rescaled
 from support.real_data import RealFiles
 from support.scenes import table_1
 from support.slow_cases import slow_but
@@ -298,6 +298,18 @@ def test_a_stretch_that_no_printer_makes_is_a_wrong_description() -> None:
     assert "no print is so far off, so its description is wrong" in reasons(estimated)
 
 
+@pytest.mark.parametrize("by", slow_but((0.06,), (0.03, -0.03, 0.06)))
+def test_a_print_that_is_described_wrongly_by_percents_is_measured(by: float) -> None:
+    rng = np.random.default_rng(3)
+    points = photographed(poses(14, rng), rng)
+    found = calibrate(replace(points, world=points.world / [1 + by, 1, 1]))
+    assert found.target is not None
+    assert found.target.sides()[0] == pytest.approx(abs(by), rel=0.06)
+    assert f" % longer along {'XY'[by < 0]}, compared with" in reasons(found)
+    for name in ("alpha_u", "alpha_v", "u0", "v0"):
+        assert abs(getattr(found.intrinsics, name) - getattr(CAMERA.intrinsics, name)) < 4 * found.std[name]
+
+
 @pytest.mark.parametrize("by", [0.3, 0.6])
 def test_the_bend_and_what_it_costs(by: float) -> None:
     found = curled(by, 1)
@@ -440,6 +452,17 @@ def test_field_reports(real_files: RealFiles, name: str, words: str) -> None:
     assert words in reasons(found)
     assert found.verdict is not None
     assert found.verdict.word != "good"
+
+
+@pytest.mark.parametrize("name", ["print1030_20_0", "print1030_35_1"])
+def test_prints_described_wrongly_by_three_percent_give_the_true_camera(
+    real_files: RealFiles, name: str
+) -> None:
+    """The second one is bowed by 2 mm as well, which is told of the target, not as a second cause."""
+    found = calibrate(read_points(real_files(f"field_reports/{name}.csv")[0]))
+    assert abs(found.intrinsics.alpha_u - 625) < 4 * found.std["alpha_u"] < 4
+    assert abs(found.intrinsics.alpha_v - 625) < 4 * found.std["alpha_v"] < 5
+    assert "bent by" not in reasons(found)
 
 
 def test_a_curl_of_four_tenths_of_a_millimetre(real_files: RealFiles) -> None:
