@@ -149,10 +149,11 @@ def linearised(
     middle = np.zeros(2)
     if image_size is not None:
         middle = ((np.array(image_size) - 1) / 2 - views.pixel_centre) / views.pixel_scale
-    parts = list(_derivatives(views, state, middle, board, effects))
-    widths = parts[0][2]
-    flat = [J.reshape(*J.shape[:2], -1) for _, J, _ in parts]
-    N = views.batches.sum_by_view(np.concatenate([J @ np.swapaxes(J, 1, 2) for J in flat]))
+    products = []  # of one chunk after the other, as the derivatives of all take far more memory
+    for _, J, found in _derivatives(views, state, middle, board, effects):
+        flat, widths = J.reshape(*J.shape[:2], -1), found
+        products.append(flat @ np.swapaxes(flat, 1, 2))
+    N = views.batches.sum_by_view(np.concatenate(products))
     kept = np.concatenate([camera_columns(K), np.arange(11 + K, N.shape[1])])
     if free_poses:
         R, solved = eliminate(N, kept, POSE_COLUMNS, RIDGE)

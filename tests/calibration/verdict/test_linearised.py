@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -188,3 +189,18 @@ def test_the_page_lists_all_causes() -> None:
     import causes
 
     assert causes.table() in (PROJECT / "docs" / "reference" / "causes.md").read_text(encoding="utf-8")
+
+
+def test_the_derivatives_of_many_points_are_never_held_all_at_once() -> None:
+    points, state = exact()
+    world, pixels, view = (np.concatenate(100 * [of]) for of in (points.world, points.pixels, points.view))
+    many = Correspondences(world, pixels, view)
+    views = arrange(many)
+    there, free = normalised(state, views), np.ones(5, dtype=bool)
+    tracemalloc.start()
+    try:
+        lin = linearised(views, there, free, True, EFFECTS, SIZE, False)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 0.5 * len(many) * 2 * (lin.width + 7) * 8
