@@ -67,9 +67,11 @@ class _LazyGroup(click.Group):
     context_class = HelpContext
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of all commands."""
         return list(_SUMMARIES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of a name, loaded now."""
         # All are loaded for a wrong name, so that click can suggest the nearest one.
         for name in [cmd_name] if cmd_name in _SUMMARIES else _SUMMARIES:
             if name not in self.commands:

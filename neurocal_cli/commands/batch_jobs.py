@@ -94,6 +94,7 @@ class _Maker:
         self._inputs: list[str] = []
 
     def job(self, sources: dict[str, str], cells: Mapping[str, tuple[str, str]]) -> Job:
+        """The job of these sources of points; cells have the folders that their paths are relative to."""
         kind = _kind(sources)
         first = sources.pop("images", None)
         if kind in ("calibrate", "stereo"):

@@ -34,6 +34,7 @@ class _Group(options.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command, that of a file by what it holds."""
         if args and args[0] not in self.commands and os.path.isfile(args[0]):
             from neurocal_cli.files.camera_tree import own_kind, read_tree
 

@@ -137,11 +137,18 @@ def given_camera(
         elif points.image_size != tuple(camera.image_size):
             raise InputError(
                 f"{path}: the camera is for images of {camera.image_size[0]} x {camera.image_size[1]} px, "
-                f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; give a camera "
-                "for this image size or, if the images were resized, make it: neurocal resize CAMERA.yaml "
-                f"--to {points.image_size[0]} {points.image_size[1]} -o RESIZED.yaml"
+                f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; "
+                f"{camera_of_size(points.image_size)}"
             )
     return points, camera
+
+
+def camera_of_size(size: tuple[int, int]) -> str:
+    """Advice on images of another size than those of a camera."""
+    return (
+        "give a camera for this image size or, if the images were resized, make it: neurocal resize "
+        f"CAMERA.yaml --to {size[0]} {size[1]} -o RESIZED.yaml"
+    )
 
 
 def calibration_or_camera(

@@ -25,6 +25,7 @@ class _Command(options.Command):
     """A command in which ``--distortion NAME=MODEL`` sets the model of one camera."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse, after ``--distortion NAME=MODEL`` has become ``--distortion-of``."""
         words: list[str] = []
         for word in args:
             if word.startswith("--distortion=") and "=" in word[13:]:

@@ -29,6 +29,7 @@ class _Command(options.Command):
     """A command that takes several values after --sigma, as in ``--sigma 0.5 1 2``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse, after each value has got an option of its own."""
         expanded: list[str] = []
         after = False
         for word in args:

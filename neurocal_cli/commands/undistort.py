@@ -340,12 +340,11 @@ class _Undistorting:
 
         points = noted(read_points, path)
         self.size = self.size or points.image_size
-        if points.image_size not in (None, self.size):
+        if points.image_size is not None and points.image_size != self.size:
+            own, there = ("{} x {} px".format(*size) for size in (points.image_size, self.size or ()))
             raise InputError(
-                f"{points.source}: the image_size is {_size(points.image_size)}, but the camera is for "
-                f"{_size(self.size)}; give a camera for this image size or, if the images were resized, make "
-                f"it: neurocal resize CAMERA.yaml --to {' '.join(map(str, points.image_size or ()))} "
-                "-o RESIZED.yaml"
+                f"{points.source}: the image_size is {own}, but the camera is for {there}; "
+                f"{preparation.camera_of_size(points.image_size)}"
             )
         if why := undistorted_before(points, self.camera):
             warn(why)
@@ -361,7 +360,3 @@ class _Undistorting:
                 "degrees from the axis or more; --to cylinder keeps them"
             )
         return format_points(map_points(points.select(kept), self.camera, new))
-
-
-def _size(size: tuple[int, int] | None) -> str:
-    return "unknown" if size is None else f"{size[0]} x {size[1]} px"

@@ -46,11 +46,7 @@ class SimulatedRig:
     def relative(self) -> dict[str, Pose]:
         """Poses relative to the first camera, X_c = R X_first + t."""
         first = next(iter(self.mounted.values()))
-        found = {}
-        for name, pose in self.mounted.items():
-            R = pose.R @ first.R.T
-            found[name] = Pose(R, pose.t - R @ first.t)
-        return found
+        return {name: pose.relative_to(first) for name, pose in self.mounted.items()}
 
     def points(
         self,
