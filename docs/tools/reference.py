@@ -1,16 +1,17 @@
 """Write the reference pages from the program itself: the commands' help and the names of the package.
 
-Run ``python docs/tools/reference.py`` and commit the result; a test compares the pages with the program.
+Run ``python docs/tools/reference.py`` and commit the result; a test compares the pages with the program. It
+writes the man pages as well.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
+from man_pages import man_pages, root, walk
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
@@ -21,6 +22,7 @@ from neurocal_cli.files.other_boards import FORMATS as BOARDS
 from neurocal_cli.files.points_csv import POINTS
 
 DOCS = Path(__file__).resolve().parents[1]
+MAN = DOCS.parent / "man"
 _MANY_SHARED = 5  # options; fewer are described again
 MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
 
@@ -47,22 +49,8 @@ TOPICS = {
 
 def pages() -> dict[str, str]:
     """Paths below ``docs`` and texts of all pages that are made here."""
-    made = {f"commands/{_file(ctx)}": _command_page(ctx) for ctx in _walk(_root())}
+    made = {f"commands/{_file(ctx)}": _command_page(ctx) for ctx in walk(root())}
     return made | {"reference/api.md": _api_page(), "reference/formats.md": _formats_page()}
-
-
-def _root() -> click.Context:
-    return click.Context(neurocal, info_name="neurocal", **neurocal.context_settings)
-
-
-def _walk(ctx: click.Context) -> Iterator[click.Context]:
-    """The command and all below it that a user sees."""
-    yield ctx
-    if isinstance(ctx.command, click.Group):
-        for name in ctx.command.list_commands(ctx):
-            command = ctx.command.get_command(ctx, name)
-            if command is not None and not command.hidden:
-                yield from _walk(click.Context(command, info_name=name, parent=ctx))
 
 
 def _file(ctx: click.Context) -> str:
@@ -75,7 +63,7 @@ def _command_page(ctx: click.Context) -> str:
     parts = [MADE, f"# {ctx.command_path}", _prose(summary), _code(ctx.get_usage().partition(": ")[2])]
     examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
     parts += [_paragraph(p) for p in paragraphs if p not in examples]
-    parts += _list("Commands", [(_link(child), _summary(child)) for child in list(_walk(ctx))[1:]])
+    parts += _list("Commands", [(_link(child), _summary(child)) for child in list(walk(ctx))[1:]])
     parts += _list(
         "Arguments",
         [(f"`{p.metavar}`", p.description) for p in ctx.command.params if hasattr(p, "description")],
@@ -91,7 +79,7 @@ def _options(ctx: click.Context) -> list[tuple[str, str]]:
     own = _described(ctx)
     calibrate = neurocal.get_command(ctx, "calibrate")
     assert calibrate is not None
-    there = _described(click.Context(calibrate, info_name="calibrate", parent=_root()))
+    there = _described(click.Context(calibrate, info_name="calibrate", parent=root()))
     shared = [option for option in own if option in there]
     if ctx.command is calibrate or len(shared) < _MANY_SHARED:
         return own
@@ -274,3 +262,5 @@ if __name__ == "__main__":
     for path, text in pages().items():
         (DOCS / path).parent.mkdir(exist_ok=True)
         (DOCS / path).write_text(text, encoding="utf-8")
+    for name, text in man_pages().items():
+        (MAN / name).write_text(text, encoding="utf-8")

@@ -33,7 +33,7 @@ from neurocal_cli.errors import NeurocalError, UsageError
 
 __all__ = ["neurocal"]
 
-# Each command is the function of this name in the module of this name, or in that of `_WITH`; None: hidden.
+# Each command is the function of this name in the module of this name, or in that of `_WITH`.
 # The summaries stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "advise": "Advise which views of the target to photograph next.",
@@ -56,13 +56,12 @@ _SUMMARIES = {
     "target": "Write the board with its estimated shape.",
     "triangulate": "Compute points in space from their pixels in two images or more.",
     "undistort": "Remove the lens distortion from images and points.",
-    "man": None,
 }
 _WITH = {"stereo": "rig", "target": "board"}
 
 
 class _LazyGroup(click.Group):
-    """A group that imports a command's module only when it is used; a hidden command has no summary."""
+    """A group that imports a command's module only when it is used."""
 
     context_class = HelpContext
 
@@ -91,7 +90,7 @@ class _LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the table of commands without loading them."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, text in _SUMMARIES.items() if text])
+            formatter.write_dl(list(_SUMMARIES.items()))
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any

@@ -1,9 +1,8 @@
-"""Man pages generated from the commands' help, so that both always agree."""
+"""Man pages made from the commands' help, so that both always agree; `reference.py` writes them."""
 
 from __future__ import annotations
 
 import inspect
-import os
 import re
 import textwrap
 from collections.abc import Iterable, Iterator
@@ -11,8 +10,7 @@ from collections.abc import Iterable, Iterator
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands import options
-from neurocal_cli.files.writing import make_folder, write_whole
+from neurocal_cli.commands import neurocal, options
 
 _EXIT_STATUS = (
     ("0", "Done."),
@@ -53,42 +51,26 @@ _DATE = "2026-11-22"  # date of this version's manual, not the current one, so t
 _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, an unexpected error shows where in the program it arose."),)
 
 
-@click.command(hidden=True)
-@click.argument(
-    "directory",
-    metavar="DIR",
-    type=click.Path(file_okay=False),
-    cls=options.Argument,
-    description="Folder for the man pages.",
-)
-@click.pass_context
-def man(ctx: click.Context, directory: str) -> None:
-    """Write the man pages of all commands into a folder.
-
-    \b
-    Examples:
-      neurocal man man
-    """  # noqa: D301 - as in the group
-    make_folder(directory)
-    for name, page in man_pages(ctx.find_root().command).items():
-        write_whole(os.path.join(directory, name), page)
-
-
-def man_pages(root: click.Command) -> dict[str, str]:
-    """File names and texts of the man pages of a command and its subcommands that are not hidden."""
-    contexts = list(_walk(click.Context(root, info_name="neurocal", **root.context_settings)))
+def man_pages() -> dict[str, str]:
+    """File names and texts of the man pages of all commands."""
+    contexts = list(walk(root()))
     names = [_page_name(ctx) for ctx in contexts]
     return {f"{_page_name(ctx)}.1": _page(ctx, names) for ctx in contexts}
 
 
-def _walk(ctx: click.Context) -> Iterator[click.Context]:
+def root() -> click.Context:
+    """The context of the whole program."""
+    return click.Context(neurocal, info_name="neurocal", **neurocal.context_settings)
+
+
+def walk(ctx: click.Context) -> Iterator[click.Context]:
+    """A command and all below it."""
     yield ctx
-    group = ctx.command
-    if isinstance(group, click.Group):
-        for name in group.list_commands(ctx):
-            command = group.get_command(ctx, name)
-            if command is not None and not command.hidden:
-                yield from _walk(click.Context(command, info_name=name, parent=ctx))
+    if isinstance(ctx.command, click.Group):
+        for name in ctx.command.list_commands(ctx):
+            command = ctx.command.get_command(ctx, name)
+            assert command is not None
+            yield from walk(click.Context(command, info_name=name, parent=ctx))
 
 
 def _page_name(ctx: click.Context) -> str:
@@ -100,7 +82,7 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     summary, description, examples = _split_help(ctx.command.help or "")
     name, brief = _page_name(ctx), summary[:1].lower() + summary[1:].rstrip(".")
     others = [other for other in names if other != name]
-    children = [child for child in list(_walk(ctx))[1:] if not isinstance(child.command, click.Group)]
+    children = [child for child in list(walk(ctx))[1:] if not isinstance(child.command, click.Group)]
     commands = [(child.command_path, _split_help(child.command.help or "")[0]) for child in children]
     arguments = options.arguments(ctx.command)
     words = [rf"\fB{_escape(ctx.command_path)}\fR", r"[\fIOPTIONS\fR]"]
@@ -108,7 +90,7 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     if isinstance(ctx.command, click.Group):
         words.append(r"\fICOMMAND\fR ...")
     lines = [
-        r".\" Made by `neurocal man` from the command's help; edit that instead.",
+        r".\" Made by docs/tools/reference.py from the command's help; edit that instead.",
         f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
         ".ad l",  # words of choices are so long that lines cannot be adjusted
         *_section("NAME", _wrap(rf"{_escape(name)} \- {_escape(brief)}")),
@@ -139,7 +121,7 @@ def _options(ctx: click.Context) -> list[tuple[str, str]]:
     """Each option with its values, its help and its default."""
     rows = []
     for option in ctx.command.get_params(ctx):
-        if isinstance(option, click.Option) and not option.hidden:
+        if isinstance(option, click.Option):
             head = ", ".join(sorted(option.opts, key=len))  # Click 8.1 has those of help in any order
             bare = option.is_flag or option.count
             choices = option.type.choices if isinstance(option.type, click.Choice) else ()
