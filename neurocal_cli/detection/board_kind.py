@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.detection.appearance import are_plain
 from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, seen_circles
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
-from neurocal_cli.detection.grid import Grid, squares_of, weights_within
+from neurocal_cli.detection.finding.saddles import grey_levels
+from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.found import SeenMarkers, agreed_markers, seen_markers
 from neurocal_cli.detection.placement import End, NoBoardError, board_ends
 from neurocal_cli.errors import plural
@@ -41,11 +42,6 @@ _BESIDE = 1.5  # boards whose squares are smaller by more than this are behind t
 _ENOUGH = 0.2  # least share of the votes for the board's size, and greatest share of the grids that exceed it
 _CHANCE = 20  # vertices; smaller ones occur by chance in codes such as QR
 _CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
-# Places in a square where its levels are looked at.
-_WITHIN = weights_within(np.stack(np.meshgrid(*[np.linspace(0.2, 0.8, 9)] * 2), axis=-1).reshape(-1, 2))
-# Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
-# and 0.1 and more on boards with markers.
-_LEVEL = 0.07
 
 
 class Vote(IntEnum):
@@ -91,22 +87,9 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
         vote = Vote.SURE if states == {End.BOARD} else Vote.WHOLE
     near = (x for x in others if _is_whole(x.seen) and x.square * _BESIDE > foremost.square)
     beside = tuple(_ordered(x.shape) for x in near)
-    return SeenBoard(_ordered(foremost.shape), vote, beside, _is_plain(grey, foremost))
-
-
-def _is_plain(grey: NDArray[np.generic], grid: Grid) -> bool:
-    """Whether most squares of either colour are of one level, compared with the contrast of the board."""
-    corners = squares_of(grid.pixels)
-    whole = np.isfinite(corners).all(axis=(2, 3))
-    levels = interpolate(grey_levels(grey), _WITHIN @ corners[whole])
-    # Means of nine samples are hardly noisy.
-    means = levels.reshape(-1, 3, 3, 3, 3).mean(axis=(2, 4)).reshape(-1, 9)
-    colour = (np.indices(whole.shape).sum(axis=0) % 2)[whole]
-    if min(np.bincount(colour, minlength=2)) == 0:
-        return True
-    middle = [float(np.median(means[colour == k])) for k in (0, 1)]
-    spread = max(float(np.median(means[colour == k].std(axis=1))) for k in (0, 1))
-    return spread < _LEVEL * abs(middle[1] - middle[0])
+    return SeenBoard(
+        _ordered(foremost.shape), vote, beside, are_plain(grey_levels(grey), foremost.pixels, foremost.dark)
+    )
 
 
 def _is_whole(seen: NDArray[np.bool_]) -> bool:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.appearance import are_circles
+from neurocal_cli.detection.appearance import are_circles
 from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
 from neurocal_cli.detection.placement import NoBoardError

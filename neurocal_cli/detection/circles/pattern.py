@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
-from neurocal_cli.detection.circles.appearance import are_circles
+from neurocal_cli.detection.appearance import are_circles
 from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.placement import NoBoardError

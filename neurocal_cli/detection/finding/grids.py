@@ -4,11 +4,8 @@ On a reduced image, saddle points of the brightness are linked along edges, and 
 vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. If linked
 saddles are left over, `straighten` searches again in a view without the distortion of a wide lens.
 
-Lattices between round marks are left out. Between staggered circles the brightness has saddle points like
-those at the vertices of squares, and they form a grid. But a circle reaches equally far in all directions,
-where a square reaches 1.4 times as far towards its corners as towards its sides. Overexposed squares are
-smaller and blurred ones are rounder, but not so much. And light and ink move all edges alike, so that squares
-with gaps along one axis alone, such as windows in shifted rows, are no chessboard.
+Lattices between other marks are left out: between staggered circles, the brightness has saddle points like
+those at the vertices of squares, and they form a grid (`appearance`).
 """
 
 from __future__ import annotations
@@ -22,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.appearance import are_squares
 from neurocal_cli.detection.finding.grow import grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.links import Links, find_links, find_seeds
@@ -31,9 +29,9 @@ from neurocal_cli.detection.finding.overlaps import (
     split_at_folds,
     trim_overlaps,
 )
-from neurocal_cli.detection.finding.saddles import Level, dense_parts, interpolate, levels_of, pyramid
+from neurocal_cli.detection.finding.saddles import Level, dense_parts, levels_of, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
-from neurocal_cli.detection.grid import Grid, squares_of, weights_within
+from neurocal_cli.detection.grid import Grid, squares_of
 
 Size = tuple[int, int]
 
@@ -61,7 +59,7 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
-    lattices = [x for x in _find(levels, wanted) if _has_squares(levels[0], x)]
+    lattices = [x for x in _find(levels, wanted) if are_squares(levels[0].image, x.pixels, x.dark)]
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 
@@ -223,64 +221,3 @@ def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
         cv2.fillPoly(mask, list(whole), 255)
         cv2.polylines(mask, list(whole), True, 255, thickness)
     return mask
-
-
-# With these values test_finding.py tells photographs of circles from boards: the ratio is 0.71 to 0.74 on
-# circles, and at least 0.93 on boards.
-_ROUND = 0.82  # reach towards the corners over that towards the sides, both as shares of a square's own
-# Greatest difference of the gaps along both axes: squares, and px. It is at most 0.024 squares and 0.7 px on
-# boards, and 0.12 in windows in shifted rows (test_things_in_shifted_rows_are_no_chessboard).
-_GAP, _GAP_PX = 0.05, 1.0
-_APART = 0.8  # least level at the corners, from 0 of the square's own colour to 1 of the other
-_MOST = 60  # squares of a colour that are examined
-_FEWEST = 4
-_RAYS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]])  # last four: corners
-_STEPS = np.linspace(0, 0.5, 21)  # of the square's side
-_PLACES = 0.5 + _RAYS[:, None] * _STEPS[:, None]  # (8, 21, 2) in the unit square
-_CORNERS = weights_within(_PLACES.reshape(-1, 2))
-
-
-def _has_squares(level: Level, lattice: Lattice) -> bool:
-    """Whether the marks of a lattice are neither round nor have gaps along one axis alone."""
-    quads = squares_of(lattice.pixels)
-    known = np.isfinite(quads).all(axis=(2, 3))
-    row, col = np.nonzero(known)
-    centre, beside = np.zeros((2, known.shape[0] + 2, known.shape[1] + 2))
-    beside[1:-1, 1:-1] = known
-    centre[row + 1, col + 1] = interpolate(level.image, quads[row, col].mean(axis=1))
-    # The light changes over the board, so a square is compared with its neighbours.
-    total, count = (x[:-2, 1:-1] + x[2:, 1:-1] + x[1:-1, :-2] + x[1:-1, 2:] for x in (centre, beside))
-    step = (total / np.maximum(count, 1) - centre[1:-1, 1:-1])[row, col]
-    dark = (row + col + lattice.dark) % 2 == 0
-    groups = [_spread(np.flatnonzero(dark == colour)) for colour in (True, False)]
-    if min(map(len, groups)) < _FEWEST:
-        return True
-    return all(_is_square(level, quads[row[some], col[some]], step[some]) for some in groups)
-
-
-def _spread(which: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """At most `_MOST` of them, evenly spread."""
-    return which[:: -(-len(which) // _MOST)] if len(which) else which
-
-
-def _is_square(level: Level, quads: Array, step: Array) -> bool:
-    """Whether marks of one colour are square, by the median of their reaches in all directions.
-
-    The quadrangles (N, 4, 2) are in px; `step` (N,) [DN] leads from the light in their middles to that of the
-    other colour.
-    """
-    values = interpolate(level.image, _CORNERS @ quads).reshape(len(quads), len(_RAYS), -1)
-    away = (values - values[:, :1, :1]) / np.where(step == 0, np.inf, step)[:, None, None]
-    beyond = away > 0.5
-    reach = np.where(beyond.any(axis=-1), _STEPS[beyond.argmax(axis=-1)], _STEPS[-1])
-    sides, corners = reach[:, :4].mean(axis=1), reach[:, 4:].mean(axis=1)
-    apart = np.median(away[:, 4:, -1]) >= _APART  # else they touch at their corners
-    if apart and np.median(corners / np.maximum(sides, _STEPS[1])) < _ROUND:
-        return False
-    along, down = quads[:, 3] - quads[:, 0], quads[:, 2] - quads[:, 1]
-    area = 0.5 * np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
-    lengths = 0.5 * np.stack([np.hypot(*(along + way * down).T) for way in (1, -1)], axis=-1)
-    widths = area[:, None] / np.maximum(lengths, 1e-9)
-    gaps = (_STEPS[-1] - reach[:, :4].reshape(-1, 2, 2).mean(axis=2)) * widths
-    odd = abs(float(np.subtract(*np.median(gaps, axis=0))))
-    return bool(odd < max(_GAP * float(np.median(widths.min(axis=1))), _GAP_PX))

@@ -1,12 +1,23 @@
-"""What a grid of circles looks like: marks of one ink at the places of a plane, round, on blank paper.
+"""What a board looks like: marks of one shape and one ink, with blank paper between them.
+
+The light around all marks is compared in the coordinates of the board, in which circles are circles and
+squares are squares whatever the tilt, and averaged. So noise and things before the board matter little.
 
 Pips of dice, keys, lamps, pieces of a game and bottles in a crate stand in rows, too. But a die has an
 outline and a compartment a wall, so the light changes between the marks; signs are in keys; lamps may be off;
 other marks are long or have corners. Ink reflects the same share of the paper's light at all places; all
 circles of a board have one radius; and from its middle outwards, the light of a disc or a ring has the steps
 of one blurred edge or two, where that of a ball, of a coin or of a target has others.
-The light around all marks is averaged in the coordinates of the
-board, in which circles are circles whatever the tilt. So noise and things before the board matter little.
+
+The squares of a chessboard meet at their corners, unless light or ink have moved all edges alike. Then the
+light at the middles of the edges tells the light at the corners, whatever the blur. With s(t) the share of
+its own colour at a distance t within a side, it is on the diagonal, as near to both sides,
+
+    s(t)^2 + s(-t)^2 - max(s(t) + s(-t) - 1, 0)^2
+
+The second term is the next square of that colour, and the last is what both share if they overlap. Round
+marks and squares with rounded corners have less there. Squares with gaps along one axis alone, such as
+windows in shifted rows, are no chessboard; and squares that are not of one level have markers in them.
 """
 
 from __future__ import annotations
@@ -16,6 +27,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import Image, interpolate
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density
+from neurocal_cli.detection.grid import squares_of, weights_within
 from neurocal_cli.detection.markers.lattice import flattening_of, predicted
 
 _RAYS = 16
@@ -170,3 +182,81 @@ def _ruled(levels: Array, within: Array) -> float:
     smooth[:, 3:] = 0
     away = np.abs(mean - np.fft.irfft(smooth, _RAYS, axis=1))
     return float((away - _SURE * noise).max(initial=0.0))
+
+
+_MOST, _FEWEST = 60, 4  # squares of a colour that are examined
+_TO_SIDES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+_TO_CORNERS = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
+_BEYOND = 10  # steps
+_DEPTH = np.linspace(-0.25, 0.5, 3 * _BEYOND + 1)  # [squares] within a side; its place is that of `_BEYOND`
+_ON_RAYS = weights_within(
+    (0.5 + np.concatenate([_TO_SIDES, _TO_CORNERS])[:, None] * (0.5 - _DEPTH[:, None])).reshape(-1, 2)
+)
+_CENTRE = weights_within(0.5 + 0.15 * np.concatenate([[[0, 0]], _TO_SIDES, _TO_CORNERS]))
+_FLAT = 18  # steps from which a square has one level: 0.2 of it
+# Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.013, circles 0.13.
+_ROUNDED, _ROUNDED_PX = 0.025, 0.5
+# Greatest difference of the gaps along both axes: squares, and px. It is at most 0.024 squares and 0.7 px on
+# boards, and 0.12 in windows in shifted rows (test_things_in_shifted_rows_are_no_chessboard).
+_GAP, _GAP_PX = 0.05, 1.0
+# Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
+# and 0.1 and more on boards with markers.
+_LEVEL = 0.07
+
+
+def are_squares(light: Image, pixels: Array, dark: int) -> bool:
+    """Whether marks between vertices (rows, cols, 2) are squares; `dark` is that of `Grid`."""
+    every = [(quads, own) for quads, own in _squares(light, pixels, dark) if len(own) >= _FEWEST]
+    return len(every) < 2 or all(_meet(quads, own) for quads, own in every)
+
+
+def are_plain(light: Image, pixels: Array, dark: int) -> bool:
+    """Whether most squares of either colour are of one level, compared with the contrast of the board."""
+    spread = []
+    for _, own in _squares(light, pixels, dark):
+        # Means of some samples are hardly noisy.
+        parts = own[..., _FLAT:-1].reshape(len(own), -1, 6).mean(axis=2)
+        spread.append(float(np.median(parts.std(axis=1))) if len(own) else 0.0)
+    return max(spread) < _LEVEL
+
+
+def _squares(light: Image, pixels: Array, dark: int) -> list[tuple[Array, Array]]:
+    """Squares (N, 4, 2) of each colour, and the share of their own level (N, 8, depths) on rays outwards.
+
+    The share is 0 where they have the level of their neighbours, as the light changes over the board.
+    """
+    quads = squares_of(pixels)
+    known = np.isfinite(quads).all(axis=(2, 3))
+    row, col = np.nonzero(known)
+    quads = quads[row, col]
+    centre, beside = np.zeros((2, known.shape[0] + 2, known.shape[1] + 2))
+    beside[1:-1, 1:-1] = known
+    centre[row + 1, col + 1] = interpolate(light, _CENTRE @ quads).mean(axis=1)
+    total, count = (x[:-2, 1:-1] + x[2:, 1:-1] + x[1:-1, :-2] + x[1:-1, 2:] for x in (centre, beside))
+    level = centre[row + 1, col + 1]
+    step = level - (total / np.maximum(count, 1))[row, col]
+    result = []
+    for colour in (0, 1):
+        some = np.flatnonzero((row + col + dark) % 2 == colour)
+        some = some[:: -(-len(some) // _MOST) or 1]
+        away = interpolate(light, _ON_RAYS @ quads[some]) - level[some, None]
+        own = 1 + away / np.where(step[some] == 0, np.inf, step[some])[:, None]
+        result.append((quads[some], own.reshape(len(some), -1, len(_DEPTH))))
+    return result
+
+
+def _meet(quads: Array, own: Array) -> bool:
+    """Whether squares (N, 4, 2) of one colour have sharp corners, and gaps along both axes or none."""
+    shares = np.median(own, axis=0)
+    sides, corners = shares[:4].reshape(2, 2, -1).mean(axis=1), shares[4:].mean(axis=0)[_BEYOND:]
+    within, beyond = sides.mean(axis=0)[_BEYOND:], np.zeros(len(corners))
+    beyond[: _BEYOND + 1] = sides.mean(axis=0)[_BEYOND::-1]
+    expected = within**2 + beyond**2 - np.maximum(within + beyond - 1, 0) ** 2
+    along, down = quads[:, 3] - quads[:, 0], quads[:, 2] - quads[:, 1]
+    area = 0.5 * np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
+    lengths = 0.5 * np.stack([np.hypot(*(along + way * down).T) for way in (1, -1)], axis=-1)
+    widths = np.median(area[:, None] / np.maximum(lengths, 1e-9), axis=0)
+    narrow = float(widths.min())
+    rounded = float((expected - corners).sum() * (_DEPTH[1] - _DEPTH[0]))
+    odd = float(np.ptp(_DEPTH[(sides > 0.5).argmax(axis=1)] * widths))
+    return rounded < max(_ROUNDED, _ROUNDED_PX / narrow) and odd < max(_GAP * narrow, _GAP_PX)
