@@ -16,8 +16,8 @@ its own colour at a distance t within a side, it is on the diagonal, as near to 
     s(t)^2 + s(-t)^2 - max(s(t) + s(-t) - 1, 0)^2
 
 The second term is the next square of that colour, and the last is what both share if they overlap. Round
-marks and squares with rounded corners have less there. Squares with gaps along one axis alone, such as
-windows in shifted rows, are no chessboard; and squares that are not of one level have markers in them.
+marks, squares with rounded corners, and those with gaps along one axis alone, such as windows in shifted
+rows, have less there. Squares that are not of one level have markers in them.
 """
 
 from __future__ import annotations
@@ -196,9 +196,6 @@ _CENTRE = weights_within(0.5 + 0.15 * np.concatenate([[[0, 0]], _TO_SIDES, _TO_C
 _FLAT = 18  # steps from which a square has one level: 0.2 of it
 # Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.013, circles 0.13.
 _ROUNDED, _ROUNDED_PX = 0.025, 0.5
-# Greatest difference of the gaps along both axes: squares, and px. It is at most 0.024 squares and 0.7 px on
-# boards, and 0.12 in windows in shifted rows (test_things_in_shifted_rows_are_no_chessboard).
-_GAP, _GAP_PX = 0.05, 1.0
 # Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
 # and 0.1 and more on boards with markers.
 _LEVEL = 0.07
@@ -246,17 +243,14 @@ def _squares(light: Image, pixels: Array, dark: int) -> list[tuple[Array, Array]
 
 
 def _meet(quads: Array, own: Array) -> bool:
-    """Whether squares (N, 4, 2) of one colour have sharp corners, and gaps along both axes or none."""
+    """Whether squares (N, 4, 2) of one colour have sharp corners, and no gaps along one axis alone."""
     shares = np.median(own, axis=0)
-    sides, corners = shares[:4].reshape(2, 2, -1).mean(axis=1), shares[4:].mean(axis=0)[_BEYOND:]
-    within, beyond = sides.mean(axis=0)[_BEYOND:], np.zeros(len(corners))
-    beyond[: _BEYOND + 1] = sides.mean(axis=0)[_BEYOND::-1]
+    side = max(shares[:4].reshape(2, 2, -1).mean(axis=1), key=lambda axis: float(axis.sum()))
+    corner = shares[4:].mean(axis=0)[_BEYOND:]
+    within, beyond = side[_BEYOND:], np.zeros(len(corner))
+    beyond[: _BEYOND + 1] = side[_BEYOND::-1]
     expected = within**2 + beyond**2 - np.maximum(within + beyond - 1, 0) ** 2
-    along, down = quads[:, 3] - quads[:, 0], quads[:, 2] - quads[:, 1]
-    area = 0.5 * np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
-    lengths = 0.5 * np.stack([np.hypot(*(along + way * down).T) for way in (1, -1)], axis=-1)
-    widths = np.median(area[:, None] / np.maximum(lengths, 1e-9), axis=0)
-    narrow = float(widths.min())
-    rounded = float((expected - corners).sum() * (_DEPTH[1] - _DEPTH[0]))
-    odd = float(np.ptp(_DEPTH[(sides > 0.5).argmax(axis=1)] * widths))
-    return rounded < max(_ROUNDED, _ROUNDED_PX / narrow) and odd < max(_GAP * narrow, _GAP_PX)
+    lost = float((expected - corner).sum() * (_DEPTH[1] - _DEPTH[0]))
+    along, down = (quads[:, 3] - quads[:, 0]).T, (quads[:, 2] - quads[:, 1]).T
+    width = np.sqrt(0.5 * float(np.median(np.abs(along[0] * down[1] - along[1] * down[0]))))
+    return lost < max(_ROUNDED, _ROUNDED_PX / max(width, 1.0))

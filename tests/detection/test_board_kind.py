@@ -198,6 +198,21 @@ def test_things_in_shifted_rows_are_no_chessboard() -> None:
     assert find_grids(no_boards.picture("windows", 186)) == []
 
 
+@pytest.mark.parametrize("radius", [0, 6])
+def test_squares_of_a_chessboard_have_sharp_corners(radius: int) -> None:
+    image = np.full((960, 1280), 220, np.uint8)
+    for row in range(6):
+        for column in range(row % 2, 8, 2):
+            left, top = 100 + 120 * column, 100 + 120 * row
+            cv2.rectangle(image, (left, top), (left + 119, top + 119), (30,), -1)
+            if radius:
+                corner = np.hypot(*np.maximum(np.abs(np.indices((120, 120)) - 59.5) - (60 - 4 * radius), 0))
+                image[top : top + 120, left : left + 120][corner > 4 * radius] = 220
+    seen = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    found = find_grids(cv2.GaussianBlur(seen, (0, 0), 1.0))
+    assert [sorted(grid.shape) for grid in found] == ([] if radius else [[5, 7]])
+
+
 def test_circles_may_be_labelled_and_sharpened() -> None:
     image = np.full((960, 1280), 190, np.uint8)
     for row in range(6):
