@@ -29,7 +29,7 @@ from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.network.local_minima import second_poses
-from neurocal_cli.observations.target import scale_of
+from neurocal_cli.observations.target import scale_of, std_of_scale
 
 _XI = 5  # index of xi, after A's five entries
 _TOLD = 0.1  # width of the range of xi from which on a warning is given
@@ -170,7 +170,9 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
         t = np.stack([problem.poses[name].t for name in views.names])
     std = np.zeros((len(R), 6))
     if problem.free_poses:
-        std = with_scale(pose_std(R, centre, views.scale, cov.own), t, scale_of(problem.points).std)
+        std = with_scale(
+            pose_std(R, centre, views.scale, cov.own), t, std_of_scale(problem.points, solution.target)
+        )
     rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
     R.setflags(write=False)
     t.setflags(write=False)

@@ -157,12 +157,17 @@ def _distances(rig: Rig) -> tuple[tuple[tuple[str, str], float], tuple[str, str]
     np.fill_diagonal(apart, np.inf)
     usual = float(median(apart.min(axis=1)))
     worst, together = ((names[0], names[1]), 0.0), None
+    target = rig.cameras[names[0]].target
+    of_scale = (
+        0.0 if target is None else target.std_of_scale()
+    )  # of a wrong description, which is told itself
     for k, name in enumerate(names[1:], 1):
         nearest = names[int(np.argmin(apart[k]))]
         pair = rig.pair(nearest, name)
         if pair.baseline < TOLD * pair.std["baseline"]:
             together = (nearest, name)
         share = pair.std["baseline"] / max(pair.baseline, 1e-3 * usual)
+        share = float(np.sqrt(max(share**2 - of_scale**2, 0.0)))
         worst = max(worst, ((nearest, name), share), key=lambda one: one[1])
     return worst, together
 

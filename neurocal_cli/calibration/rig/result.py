@@ -25,7 +25,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
-from neurocal_cli.observations.target import scale_of
+from neurocal_cli.observations.target import std_of_scale
 
 
 class RigAssembly:
@@ -36,7 +36,8 @@ class RigAssembly:
 
     def __init__(self, fit: RigFit, found: Covariance) -> None:
         self.fit, self.problem, self.state, self.columns = fit, fit.problem, fit.state, fit.state.columns
-        self.scale_std = scale_of(self.problem.calibrations[0].points).std
+        first = self.problem.calibrations[0]
+        self.scale_std = std_of_scale(first.points, first.target)
         self.found = found
         self.poses = [
             Pose(R, t * self.problem.unit) for R, t in zip(self.state.R[1:], self.state.t[1:], strict=True)

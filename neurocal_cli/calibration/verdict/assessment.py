@@ -64,7 +64,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, cross_matrix, median
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import scale_of
+from neurocal_cli.observations.target import std_of_scale
 
 # Of the pixels' spread, 0.01 px of 12 Mpx: a smaller error is that of rounded numbers, and has no cause.
 _ROUNDING = 1e-5
@@ -152,7 +152,7 @@ def position_covariance_of(calibration: Calibration, view: str) -> Array | None:
     R, tau = at.state.R[k], at.state.t[k]
     M = -at.views.scale[k] * R.T @ np.hstack([cross_matrix(tau), np.eye(3)])
     pose = calibration.pose_of(view)
-    of_scale = scale_of(calibration.points).std * (pose.R.T @ pose.t)
+    of_scale = std_of_scale(calibration.points, calibration.target) * (pose.R.T @ pose.t)
     return np.asarray(M @ at.pose_covariance[k] @ M.T + np.outer(of_scale, of_scale))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import STRETCHED
 
 WORDS = ("good", "usable", "poor")
 """By grade."""
@@ -58,8 +59,7 @@ DISPLACED = Limit(0.0002, 0.005)
 """Limits of displaced pixels, over the image's diagonal."""
 
 
-# Of nine boards of photographs, none is stretched by more than 0.7 %.
-STRETCHED_PRINT = Limit(0.01, 0.025)
+STRETCHED_PRINT = Limit(STRETCHED, 0.025)
 """Limits of a stretch of one side against the other that printers make."""
 WRONG_PRINT = "no print is so far off, so its description is wrong, and the scale of the poses unknown"
 

@@ -42,7 +42,7 @@ from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixe
 from neurocal_cli.calibration.verdict.what_is_given import MEASURE_AXES, unlike_axes
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
-from neurocal_cli.observations.target import Target
+from neurocal_cli.observations.target import MISPRINT, Target
 
 # Repeated by test_wrong_inputs.py, in which no wrong input may be good, and by test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
@@ -53,11 +53,10 @@ _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
 _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
-# rad, and of a target's size. From photographs, the image axes of eight cameras are estimated to be off a
-# right angle by up to 0.0018, and the sides of their boards by up to 0.003; the points of none of nine boards
-# are off by more than 0.0017 rms. A board that leans by 0.006 and stands upright in all views may turn theta
-# by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
-_MISPRINT = 0.004
+# rad. From photographs, the image axes of eight cameras are estimated to be off a right angle by up to
+# 0.0018. A board that leans by 0.006 and stands upright in all views may turn theta by as much;
+# test_a_leaning_board_is_not_good has one that leans by 0.01.
+_SKEWED = 0.004
 _UNCHECKED = (
     "the camera needs every view, so it may take in errors of single views, such as a board that bends, and "
     "its std do not include them",
@@ -305,7 +304,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
             "few cameras have such pixels; otherwise check the size of the squares along X and Y",
         )
-    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _MISPRINT + TOLD * std["theta"]:
+    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEWED + TOLD * std["theta"]:
         yield (
             1,
             f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.2f} degrees",
@@ -335,7 +334,7 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
     sides = stretches(given)
     stretch, lean = (sides * linear).sum(axis=(1, 2)).tolist()
     longer, other = ("XYZ"[k(stretch * np.diag(sides[0]))] for k in (np.argmax, np.argmin))
-    if "theta" not in calibration.fixed and abs(lean) > _MISPRINT:
+    if "theta" not in calibration.fixed and abs(lean) > MISPRINT:
         yield (
             1,
             f"the sides of the target are off a right angle by {np.degrees(abs(lean)):.2f} degrees, more "
@@ -348,9 +347,8 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
         f"than described: {WRONG_PRINT}",
         measure,
     )
-    plane = np.linalg.svd(given, full_matrices=False)[2][:2]
-    off = float(np.sqrt((((found - given @ linear) @ plane.T) ** 2).sum(axis=1).mean()))
-    if off > _MISPRINT * float(np.sqrt((given**2).sum(axis=1).mean())):
+    off, most = target.off_in_plane()
+    if off > most:
         yield (
             1,
             f"the points of the target lie {off:.2g} {calibration.unit} rms from where it is described, "

@@ -64,3 +64,14 @@ def test_a_reported_rig_of_a_small_board_is_whole(real_files: RealFiles) -> None
     sides = [calibrate(side, type=3, intrinsics=camera) for side in (left, right)]
     assert all(side.second_poses for side in sides)
     assert not fit_stereo(*sides, refine_cameras=False).left_out
+
+
+def test_the_scale_of_a_reported_rig_of_a_wrongly_described_grid_is_unknown(real_files: RealFiles) -> None:
+    """The tags' spacing is 0.30, described as 0.25; the baseline is 120.42 mm."""
+    sides = [calibrate(read_points(real_files(f"field_reports/apr_{side}.csv")[0])) for side in "lr"]
+    rig = fit_stereo(*sides)
+    assert 3.0 < rig.std["baseline"] < 8.0
+    assert abs(rig.baseline - 120.42) < 2 * rig.std["baseline"]
+    assert rig.verdict is not None
+    assert rig.verdict.word != "good"
+    assert "no print is so far off" in rig.verdict.reasons[0]

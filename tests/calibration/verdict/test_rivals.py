@@ -306,6 +306,9 @@ def test_a_print_that_is_described_wrongly_by_percents_is_measured(by: float) ->
     assert found.target is not None
     assert found.target.sides()[0] == pytest.approx(abs(by), rel=0.06)
     assert f" % longer along {'XY'[by < 0]}, compared with" in reasons(found)
+    assert 0.5 * abs(by) == pytest.approx(found.target.std_of_scale(), rel=0.1)
+    for one in found.views.values():  # the scale of the poses is unknown
+        assert one.std["t_z"] > 0.4 * abs(by) * one.pose.t[2]
     for name in ("alpha_u", "alpha_v", "u0", "v0"):
         assert abs(getattr(found.intrinsics, name) - getattr(CAMERA.intrinsics, name)) < 4 * found.std[name]
 
