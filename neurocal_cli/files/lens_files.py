@@ -25,6 +25,7 @@ from neurocal_cli.calibration.zoom.zoom_lens import Member, RejectedSetting, Zoo
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion, coefficient_names
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
@@ -249,7 +250,7 @@ def _table(field: Field, S: int, L: int, Q: int) -> Tables:
 _FILES = "camera"
 _CAMERAS = Schema(kind="cameras", required=_CAMERA, optional=("t_z", *CONTROLS))
 _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), labels=frozenset({_FILES}))
-_NESTED = (*POLYNOMIAL_MODELS, "rational")  # each has the coefficients of the one before it, and more
+_ORDINARY = (*POLYNOMIAL_MODELS, "rational")  # the simplest first
 
 
 def read_lens_data(
@@ -365,25 +366,17 @@ def _in_rows(table: Table) -> list[Camera]:
 
 def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array]:
     """The simplest distortion model that includes those of all cameras, and its coefficients (S, K)."""
-    models = [lens.model for lens in lenses]
-    rows = [lens.coefficients for lens in lenses]
+    for model in (*_ORDINARY, "fisheye"):
+        found = [alike for lens in lenses if (alike := with_model(lens, model)) is not None]
+        if len(found) == len(lenses):
+            return model, np.array([lens.coefficients for lens in found])
+    models = {lens.model for lens in lenses}
     if "fisheye" in models:
-        if set(models) != {"fisheye"}:
-            raise InputError(
-                f"{source}: some cameras are fisheyes and some are not; give cameras of one lens"
-            )
-        return "fisheye", np.array(rows)
-    if other := sorted(set(models) - set(_NESTED)):
-        raise InputError(
-            f"{source}: a zoom lens cannot have the distortion model {other[0]}; convert the cameras with "
-            "neurocal convert --model rational, or fisheye"
-        )
-    padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))
-    for k, row in enumerate(rows):
-        padded[k, : len(row)] = row
-    used = int(np.flatnonzero(padded.any(axis=0)).max(initial=-1)) + 1
-    model = next(name for name in _NESTED if len(MODELS[name]) >= used)
-    return model, padded[:, : len(MODELS[model])]
+        raise InputError(f"{source}: some cameras are fisheyes and some are not; give cameras of one lens")
+    raise InputError(
+        f"{source}: a zoom lens cannot have the distortion model {min(models - set(_ORDINARY))}; convert the "
+        "cameras with neurocal convert --model rational, or fisheye"
+    )
 
 
 def _controls(tables: Sequence[Table]) -> tuple[str, ...]:
