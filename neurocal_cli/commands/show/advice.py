@@ -17,7 +17,8 @@ from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import outline_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, drawing, panels_in_rows, plain, style
-from neurocal_cli.commands.show.text import attributes, printable
+from neurocal_cli.commands.show.text import attributes
+from neurocal_cli.errors import one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,13 +76,13 @@ def _px(value: float) -> str:
 
 def rig_advice_lines(advice: RigAdvice) -> list[str]:
     """A line for each view that ties two cameras of a rig."""
-    unit = printable(advice.unit)
+    unit = one_line(advice.unit)
     lines = [
         "std of where one camera sees what another one sees, of the weakest pair: "
         f"{100 * advice.share:.2g} % of the distance of the targets"
     ]
     for number, tie in enumerate(advice.views, start=1):
-        first, second = map(printable, tie.cameras)
+        first, second = map(one_line, tie.cameras)
         lines.append(
             f"{number}. {first} and {second}: in the image of {first} {_described(tie.view)}: "
             f"{tie.before:.3g} -> {tie.after:.3g} {unit}"

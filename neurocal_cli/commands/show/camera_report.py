@@ -23,13 +23,12 @@ from neurocal_cli.commands.show.text import (
     outcome_json,
     parameters,
     parameters_json,
-    printable,
     rounded,
     verdict_json,
     verdict_lines,
     with_std,
 )
-from neurocal_cli.errors import plural
+from neurocal_cli.errors import one_line, plural
 from neurocal_cli.observations.target import Target, scale_of
 
 if TYPE_CHECKING:
@@ -55,12 +54,12 @@ def calibration_report(calibration: Calibration) -> str:
     if calibration.square_pixels:
         given += ", square pixels"
     headline = (
-        f"{printable(calibration.camera_name)}: type {calibration.type} ({given}), "
+        f"{one_line(calibration.camera_name)}: type {calibration.type} ({given}), "
         f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
         f"{'image size unknown' if size is None else f'{size[0]} x {size[1]} px'}"
     )
     views = [
-        (view.rmse_px, [printable(name), str(view.n_points), _pixels(view.rmse_px)])
+        (view.rmse_px, [one_line(name), str(view.n_points), _pixels(view.rmse_px)])
         for name, view in calibration.views.items()
     ]
     fit = [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)]
@@ -88,11 +87,11 @@ def parameter_rows(calibration: Calibration) -> Table:
     if len(calibration.views) == 1:
         ((label, view),) = calibration.views.items()
         for name, value in view.pose.values.items():
-            unit = "rad" if name.startswith("R") else printable(calibration.unit)
+            unit = "rad" if name.startswith("R") else one_line(calibration.unit)
             rows.append(_parameter_row(name, unit, value, view.std[name], view.fixed))
         if not view.fixed and len(calibration.points):
             for name, value, std in _position(calibration, label):
-                own = labelled(f"camera's {name}", printable(calibration.unit))
+                own = labelled(f"camera's {name}", one_line(calibration.unit))
                 rows.append([own, *rounded(value, std), ""])
     return rows
 
@@ -209,7 +208,7 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     """The estimated target in one or two lines; none if it was used as given."""
     if target is None:
         return []
-    unit = "units" if unit == "unknown" else printable(unit)
+    unit = "units" if unit == "unknown" else one_line(unit)
     found = np.sqrt((target.offsets**2).sum(axis=1).mean())
     if target.stated is not None:
         held = int((target.stated == 0).all(axis=1).sum())
@@ -271,7 +270,7 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[Table, Table]:
     views = [["view", "points", "behind", "rms [px]", "max [px]", "pose"]]
     for name, view in e.views.items():
         numbers = [str(view.n_points), str(view.n_behind), _pixels(view.rmse_px), _pixels(view.max_px)]
-        views.append([printable(name), *numbers, "fitted" if view.fitted else "calibrated"])
+        views.append([one_line(name), *numbers, "fitted" if view.fitted else "calibrated"])
     return overall, views
 
 
@@ -314,7 +313,7 @@ def plane_tables(errors: PlaneErrors | None, unit: str) -> list[Table]:
     """Rows, the heading first: a length and two points, with the shares of calibration and pixels."""
     if errors is None:
         return []
-    unit = printable(unit)
+    unit = one_line(unit)
     rows = [[f"at {errors.distance:g} {unit}", f"std [{unit}]", "of calibration", "of pixels"]]
     for what, spread in (
         (f"a length of {errors.length:.4g} {unit}", errors.of_length),
@@ -349,11 +348,11 @@ def plane_json(errors: PlaneErrors | None) -> dict[str, Any]:
 
 def position_tables(positions: Mapping[str, CameraPosition], unit: str) -> list[Table]:
     """Rows, the heading first: where the camera was in each view; no table without views."""
-    rows = [["camera in", *(f"{axis} [{printable(unit)}]" for axis in "XYZ")]]
+    rows = [["camera in", *(f"{axis} [{one_line(unit)}]" for axis in "XYZ")]]
     for name, place in positions.items():
         pairs = zip(place.point.tolist(), place.std.tolist(), strict=True)
         cells = [with_std(value, std) if std > 0 else f"{value:.7g}" for value, std in pairs]
-        rows.append([printable(name), *cells])
+        rows.append([one_line(name), *cells])
     return [rows] if positions else []
 
 

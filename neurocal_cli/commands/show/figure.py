@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-from neurocal_cli.errors import NeurocalError
+from neurocal_cli.errors import NeurocalError, one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,9 +59,7 @@ def panels_in_rows(figure: Figure, count: int, columns: int) -> list[Axes]:
 
 def plain(text: str) -> str:
     """Escape text so that matplotlib does not read it as mathematics."""
-    from neurocal_cli.commands.show.text import printable  # not above: options need this module, but no NumPy
-
-    return printable(text).replace("$", r"\$")
+    return one_line(text).replace("$", r"\$")
 
 
 def entitle(axes: Axes, title: str) -> None:

@@ -16,7 +16,7 @@ from neurocal_cli.calibration.drift import FAR, SHARE, fleet_sigmas
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.batch_jobs import Job, Outcome
 from neurocal_cli.commands.show.html_page import figure, page, section
-from neurocal_cli.commands.show.text import printable
+from neurocal_cli.errors import one_line
 
 Row = dict[str, Any]
 # Parameters that have a column; a rich lens has dozens more.
@@ -173,7 +173,7 @@ def fleet_page(rows: Sequence[Row], name: str) -> str:
         section("The fleet", *_histograms(rows)),
         section("Cameras", _table(rows)),
     ]
-    return page(f"Fleet {printable(name)}", [part for part in parts if part])
+    return page(f"Fleet {one_line(name)}", [part for part in parts if part])
 
 
 def _list(rows: Iterable[Row], text: Callable[[Row], str]) -> str:
@@ -185,7 +185,7 @@ def _list(rows: Iterable[Row], text: Callable[[Row], str]) -> str:
 def _link(row: Row) -> str:
     """The name of a row, which leads to its report, or to its log if there is none."""
     file = "report.html" if row.get("file") else "log.txt"
-    label = escape(printable(f"{row['name']} {row['camera']}".strip()))
+    label = escape(one_line(f"{row['name']} {row['camera']}".strip()))
     if not row.get("log"):
         return label
     return f'<a href="{quote(str(row["name"]))}/{file}">{label}</a>'

@@ -34,9 +34,9 @@ from neurocal_cli.commands.show.html_page import (
 )
 from neurocal_cli.commands.show.plot_pages import edge_coverage, rig_in_space
 from neurocal_cli.commands.show.rig_report import camera_rows, pair_name, pose_rows, rig_rows, side_rows
-from neurocal_cli.commands.show.text import printable, with_std
+from neurocal_cli.commands.show.text import with_std
 from neurocal_cli.commands.show.zoom_report import lens_words, network_rows
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, one_line
 
 _MOST_REJECTED = 200  # rows
 _SETTINGS = 25  # samples along a control
@@ -70,17 +70,17 @@ def _calibration_page(calibration: Calibration, origin: Origin, photographs: Pho
         *_camera_parts(calibration, *photographs),
         _repeat("neurocal calibrate POINTS.csv", calibration, origin),
     ]
-    return page(f"Calibration of {printable(calibration.camera_name)}", parts)
+    return page(f"Calibration of {one_line(calibration.camera_name)}", parts)
 
 
 def _stereo_page(rig: StereoRig, origin: Origin, photographs: Photographs) -> str:
-    head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
+    head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {one_line(rig.unit)}"
     pairs = [["pair", "left rms [px]", "right rms [px]"]]
     for a, b in rig.pairs:
         errors = rig.left.views[a].rmse_px, rig.right.views[b].rmse_px
         pairs.append([pair_name(a, b), *(f"{error:.4f}" for error in errors)])
     left_out = [["pair", "reason"]]
-    left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
+    left_out += [[one_line(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
     parts = [
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(rig.verdict),
@@ -99,28 +99,28 @@ def _stereo_page(rig: StereoRig, origin: Origin, photographs: Photographs) -> st
 
 
 def _rig_page(rig: Rig, origin: Origin) -> str:
-    cameras, first = list(rig.cameras), printable(rig.first)
+    cameras, first = list(rig.cameras), one_line(rig.first)
     head = f"{len(cameras)} cameras connected by {len(rig.frames)} frames, rms {rig.rmse_px:.4g} px"
-    frames = [["frame", *(f"{printable(name)} rms [px]" for name in cameras)]]
+    frames = [["frame", *(f"{one_line(name)} rms [px]" for name in cameras)]]
     for name, views in rig.frames.items():
         errors = [
             f"{rig.cameras[camera].views[views[camera]].rmse_px:.4f}" if camera in views else ""
             for camera in cameras
         ]
-        frames.append([printable(name), *errors])
-    edges = [["cameras", "common frames", "cover of their images", f"distance [{printable(rig.unit)}]"]]
+        frames.append([one_line(name), *errors])
+    edges = [["cameras", "common frames", "cover of their images", f"distance [{one_line(rig.unit)}]"]]
     (_, covered), place = edge_coverage(rig), {name: k for k, name in enumerate(cameras)}
     for (a, b), count in rig.edges.items():
         pair, i, j = rig.pair(a, b), place[a], place[b]
         distance = with_std(pair.baseline, pair.std["baseline"])
         cover = f"{covered[i, j]:.0%}, {covered[j, i]:.0%}"
-        edges.append([f"{printable(a)} - {printable(b)}", str(count), cover, distance])
+        edges.append([f"{one_line(a)} - {one_line(b)}", str(count), cover, distance])
     space = figure(
         rig_in_space(rig),
         f"The cameras and the boards of all frames, seen from above and from the right of {first}.",
     )
     left_out = [["view", "reason"]]
-    left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
+    left_out += [[one_line(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
     parts = [
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(rig.verdict),
@@ -133,7 +133,7 @@ def _rig_page(rig: Rig, origin: Origin) -> str:
         _warnings(rig.warnings),
     ]
     for name, camera in rig.cameras.items():
-        parts.append(section(f"Camera {printable(name)}", " "))
+        parts.append(section(f"Camera {one_line(name)}", " "))
         parts += _camera_parts(camera)
     parts.append(_repeat("neurocal rig POINTS.csv...", rig.cameras[rig.first], origin))
     return page(f"Calibration of {len(cameras)} cameras", parts)
@@ -233,7 +233,7 @@ def _models(calibration: Calibration) -> str:
 
 def _board(calibration: Calibration) -> str:
     """Section on the target as it was found, with a drawing of each of its planes."""
-    target, unit = calibration.target, printable(calibration.unit)
+    target, unit = calibration.target, one_line(calibration.unit)
     if target is None:
         return ""
     drawings = []
@@ -299,7 +299,7 @@ def _view_parts(
 ) -> list[str]:
     """Sections on the views: a table, and a drawing of each one's residuals with the same enlargement."""
     points = calibration.points
-    unit = printable(calibration.unit)
+    unit = one_line(calibration.unit)
     rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
     figures, rejected = [], calibration.rejected.points
     for k, name in enumerate(points.view_names):
@@ -308,7 +308,7 @@ def _view_parts(
         distance = float(np.linalg.norm(view.pose.to_camera(points.world[own].mean(axis=0))))
         tilt = float(np.degrees(np.arccos(np.clip(abs(view.pose.R[2, 2]), 0, 1))))
         rows.append(
-            [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
+            [one_line(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
              f"{distance:#.5g}".rstrip("."), f"{tilt:.1f}"]
         )  # fmt: skip
         crosses = None
@@ -318,7 +318,7 @@ def _view_parts(
             points.pixels[own], residuals[own], size, scale, bold=2.2,
             left_out=crosses, photograph=photographs.get(name),
         )  # fmt: skip
-        figures.append(figure(drawing, f"{printable(name)}: {view.rmse_px:.3f} px"))
+        figures.append(figure(drawing, f"{one_line(name)}: {view.rmse_px:.3f} px"))
     return [
         section("Views", table(rows, sortable=True)),
         section(
@@ -341,9 +341,9 @@ def _rejected(calibration: Calibration) -> str:
             label = "" if points.point is None else str(points.point[k])
             u, v = points.pixels[k]
             rows.append(
-                [printable(name), printable(label), f"{u:.2f}", f"{v:.2f}", f"{rejected.error_px[k]:.2f}"]
+                [one_line(name), one_line(label), f"{u:.2f}", f"{v:.2f}", f"{rejected.error_px[k]:.2f}"]
             )
-    views = [["view", "reason"], *([printable(name), why] for name, why in rejected.views.items())]
+    views = [["view", "reason"], *([one_line(name), why] for name, why in rejected.views.items())]
     return section("Left out", table(views), table(rows, sortable=True))
 
 
@@ -381,5 +381,5 @@ def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
     entries |= facts
     if origin.versions:
         entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())
-    entries |= {f"SHA-256 of {printable(name)}": digest for name, digest in origin.files.items()}
+    entries |= {f"SHA-256 of {one_line(name)}": digest for name, digest in origin.files.items()}
     return definitions(entries)

@@ -20,13 +20,12 @@ from neurocal_cli.commands.show.text import (
     joined,
     labelled,
     outcome_json,
-    printable,
     rounded,
     verdict_json,
     verdict_lines,
     with_std,
 )
-from neurocal_cli.errors import plural
+from neurocal_cli.errors import one_line, plural
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.evaluation import SpaceError, StereoEvaluation
@@ -59,24 +58,24 @@ def camera_rows(rig: Rig) -> tuple[Table, Table]:
     found = [["camera", *(f"{name} [px]" for name in _SHOWN)]]
     for name, camera in rig.cameras.items():
         counts = str(len(camera.views)), str(len(camera.points))
-        seen.append([printable(name), *counts, camera.distortion_model, four_digits(camera.rmse_px)])
+        seen.append([one_line(name), *counts, camera.distortion_model, four_digits(camera.rmse_px)])
         cells = estimates(camera)
         values = [(" " if key in camera.fixed else " +- ").join(cells[key]) for key in _SHOWN]
-        found.append([printable(name), *values])
+        found.append([one_line(name), *values])
     return seen, found
 
 
 def pose_rows(rig: Rig) -> tuple[Table, Table]:
     """Angles and translations of each camera but the first."""
-    heading, length = f"X = R X_{printable(rig.first)} + t", printable(rig.unit)
+    heading, length = f"X = R X_{one_line(rig.first)} + t", one_line(rig.unit)
     turns = [[heading, *(f"{name} [rad]" for name in POSE_NAMES[:3])]]
     shifts = [["", *(f"{name} [{length}]" for name in POSE_NAMES[3:]), f"distance [{length}]"]]
     for name, pose in list(rig.poses.items())[1:]:
         std = rig.std[name]
         cells = [with_std(value, std[key]) for key, value in pose.values.items()]
         distance = math.sqrt(float(pose.t @ pose.t))
-        turns.append([printable(name), *cells[:3]])
-        shifts.append([printable(name), *cells[3:], with_std(distance, std["baseline"])])
+        turns.append([one_line(name), *cells[:3]])
+        shifts.append([one_line(name), *cells[3:], with_std(distance, std["baseline"])])
     return turns, shifts
 
 
@@ -85,7 +84,7 @@ def _edge_lines(rig: Rig) -> list[str]:
     edges = sorted(rig.edges.items(), key=lambda edge: -edge[1])
     if not edges:
         return []
-    told = [f"{printable(a)}-{printable(b)} {count}" for (a, b), count in edges[:_MOST_EDGES]]
+    told = [f"{one_line(a)}-{one_line(b)} {count}" for (a, b), count in edges[:_MOST_EDGES]]
     more = f" and {len(edges) - _MOST_EDGES} more pairs" if len(edges) > _MOST_EDGES else ""
     return [f"common frames: {', '.join(told)}{more}"]
 
@@ -93,8 +92,8 @@ def _edge_lines(rig: Rig) -> list[str]:
 def _fit_lines(rig: Rig) -> list[str]:
     lines = [_adjusted(rig)]
     if rig.delays:
-        told = ", ".join(f"{printable(name)} {with_std(*delay)}" for name, delay in rig.delays.items())
-        lines.append(f"images later than those of {printable(rig.first)}: {told} {_time_unit(rig)}")
+        told = ", ".join(f"{one_line(name)} {with_std(*delay)}" for name, delay in rig.delays.items())
+        lines.append(f"images later than those of {one_line(rig.first)}: {told} {_time_unit(rig)}")
     if rig.left_out:
         lines.append(f"{plural(len(rig.left_out), 'view')} left out of the rig")
     lines += target_lines(rig.cameras[rig.first].target, rig.unit)
@@ -128,7 +127,7 @@ def rig_json(rig: Rig) -> dict[str, Any]:
 
 def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
     """Rows of the tables of all points, of the cameras and of the frames, each with its heading."""
-    unit = printable(evaluation.unit)
+    unit = one_line(evaluation.unit)
     x, y, z = evaluation.by_axis.tolist()
     overall = [[f"[{unit}]", "all cameras"]]
     for label, value in (("X rms", x), ("Y rms", y), ("Z rms", z), ("rms", evaluation.rmse)):
@@ -136,10 +135,10 @@ def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
     overall += [["maximum", four_digits(evaluation.largest)], ["points", str(len(evaluation.errors))]]
     cameras = [["camera", "points", "rms from the other cameras' prediction [px]"]]
     for name, (count, error) in evaluation.predicted.items():
-        cameras.append([printable(name), str(count), four_digits(error)])
+        cameras.append([one_line(name), str(count), four_digits(error)])
     frames = [["frame", f"rms [{unit}]"]]
     worst = sorted(evaluation.frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
-    frames += [[printable(name), four_digits(error)] for name, error in worst]
+    frames += [[one_line(name), four_digits(error)] for name, error in worst]
     return (overall, cameras, frames)
 
 
@@ -185,7 +184,7 @@ def stereo_report(rig: StereoRig) -> str:
 
 def pair_name(left: str, right: str) -> str:
     """The names of the views of a pair, or the one that both have."""
-    return printable(left if left == right else f"{left} / {right}")
+    return one_line(left if left == right else f"{left} / {right}")
 
 
 def side_rows(rig: StereoRig) -> Table:
@@ -202,7 +201,7 @@ def side_rows(rig: StereoRig) -> Table:
 def rig_rows(rig: StereoRig) -> Table:
     """Rows of the pose of the right camera and the baseline, with their standard deviations."""
     rows = [["X_right = R X_left + t", "value", "std"]]
-    length = printable(rig.unit)
+    length = one_line(rig.unit)
     for name, value in rig.pose.values.items():
         unit = "rad" if name.startswith("R") else length
         rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
@@ -253,7 +252,7 @@ def stereo_json(rig: StereoRig) -> dict[str, Any]:
 def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
     """Remarks that name the views of one camera alone."""
     return [
-        f"only the {side} camera saw {', '.join(map(printable, names[:_NAMED]))}"
+        f"only the {side} camera saw {', '.join(map(one_line, names[:_NAMED]))}"
         + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
         for side, names in zip(("left", "right"), alone, strict=True)
         if names

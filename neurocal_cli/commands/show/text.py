@@ -143,11 +143,6 @@ def round_down(scale: float) -> float:
     return power * max(step for step in (1.0, 2.0, 5.0) if step <= scale / power * (1 + 1e-9))
 
 
-def printable(name: str) -> str:
-    """The name as printable text on one line, with other characters escaped."""
-    return name if name.isprintable() else ascii(name)[1:-1]
-
-
 def labelled(name: str, unit: str) -> str:
     """A quantity with its unit, if it has one."""
     return f"{name} [{unit}]" if unit else name
