@@ -146,14 +146,14 @@ class Calibration(Presented):
     fixed: frozenset[str]
     views: Mapping[str, ViewResult]
     points: Correspondences
-    type: int
     method: str
-    trainer: str
-    seed: int
-    converged: bool
     stop_reason: str
-    rmse_px: float
-    max_px: float
+    type: int = 1
+    trainer: str = "none"
+    seed: int = 0
+    converged: bool = True
+    rmse_px: float = np.nan
+    max_px: float = np.nan
     distortion_model: str = "none"
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
