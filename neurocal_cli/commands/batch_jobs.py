@@ -57,9 +57,8 @@ class Outcome:
     problem: str = ""
     seconds: float | None = None  # None if there is no record
     unchanged: bool = False  # done before
-    sent: tuple[dict[str, Any], Mapping[str, bytes]] | None = (
-        None  # record and results, for the client to write
-    )
+    # Record and results, for the client to write.
+    sent: tuple[dict[str, Any], Mapping[str, bytes]] | None = None
 
 
 def job_of(one: DataSet, common: Mapping[str, str], output: str) -> Job:

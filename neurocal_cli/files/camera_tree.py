@@ -95,9 +95,8 @@ def xml_root(text: str, source: str) -> ElementTree.Element:
 
 def _parse_xml(text: str, source: str) -> Any:
     root = xml_root(text, source)
-    if root.tag == "calibration" and (
-        root.find("projection") is not None or root.find("f") is not None
-    ):  # Agisoft's
+    agisoft = root.find("projection") is not None or root.find("f") is not None
+    if root.tag == "calibration" and agisoft:
         return {root.tag: _element_value(root, source, DEEPEST)}
     if root.tag != "opencv_storage":
         raise FormatError(
@@ -204,14 +203,10 @@ def matrix_data(field: Field, length: int) -> Array:
     if isinstance(field.value, dict) and "rows" not in field and "data" in field:
         return matrix_data(field["data"], length)
     if isinstance(field.value, dict):
-        if _is_packed(field["data"].value):
-            field = Field({**field.value, "data": _unpacked(field["data"])}, field.source, field.path)
-        nested = (
-            field["data"].value
-            and isinstance(field["data"].value, list)
-            and type(field["data"].value[0]) is list
-        )
-        data = matrix_data(field["data"], -1) if nested else field["data"].array(-1)
+        numbers = field["data"]
+        if _is_packed(numbers.value):
+            numbers = Field(_unpacked(numbers), field.source, numbers.path)
+        data = matrix_data(numbers, -1)
         rows, cols = field["rows"].integer(), field["cols"].integer()
         head = str(field["dt"].value)[:-1] if "dt" in field else ""
         channels = int(head) if head.isdigit() else 1  # dt: "2f" has two
@@ -220,9 +215,8 @@ def matrix_data(field: Field, length: int) -> Array:
         if rows * cols * channels != len(data) or (length == 9 and rows != 3):
             raise InputError(f"{field.path} has {rows} rows, {cols} cols and {len(data)} numbers; correct it")
     elif isinstance(field.value, list) and field.value and isinstance(field.value[0], dict):
-        data = np.concatenate(
-            [matrix_data(entry, -1) for entry in field.items()]
-        )  # of a matrix for each view
+        # A matrix for each view.
+        data = np.concatenate([matrix_data(entry, -1) for entry in field.items()])
     elif isinstance(field.value, list) and field.value and isinstance(field.value[0], list):
         deep, first = 0, field.value
         while isinstance(first, list):

@@ -41,9 +41,8 @@ class Schema:
     optional: tuple[str, ...] = ()
     labels: frozenset[str] = frozenset()  # the columns that contain text; all others contain numbers
     headerless: bool = False  # whether a file may have the required columns without a header
-    aliases: Mapping[str, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # plain names of columns, the best first
+    # Plain names of columns, the best first.
+    aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     others: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()  # names that mean these with the others
     instead: str = ""  # advice for files of another kind
 

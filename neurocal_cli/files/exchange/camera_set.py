@@ -61,11 +61,9 @@ class CameraSet:
         The last is known if both were given: the first is then that which is engraved on the lens.
         """
         camera = self.cameras[0]
-        film_px = (
-            _FILM
-            * float(np.sqrt(camera.entries[0] * camera.entries[2]))
-            / np.hypot(*(camera.image_size or (np.nan, np.nan)))
-        )  # focal length [mm] times the crop factor
+        diagonal = np.hypot(*(camera.image_size or (np.nan, np.nan)))
+        # Focal length [mm] times the crop factor.
+        film_px = _FILM * float(np.sqrt(camera.entries[0] * camera.entries[2])) / diagonal
         focal, crop = self.focal_mm, self.crop_factor
         if focal is None and crop is not None:
             return film_px / crop, crop, None

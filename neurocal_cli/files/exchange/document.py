@@ -160,9 +160,8 @@ class Document:
             self.is_script = bool(_MATLAB(text))
             return Field(tree, self.source)
         if failed is not None:
-            plain = re.sub(
-                r"\barray\(|(?:, *dtype=[\w.]+)?\)", "", text
-            )  # of a dictionary that Python prints
+            # A dictionary that Python prints.
+            plain = re.sub(r"\barray\(|(?:, *dtype=[\w.]+)?\)", "", text)
             if (plain := _PRINTED.sub(_with_commas, plain)) != text:
                 return parse_tree(plain, self.source)
             lines = [line.strip() for line in text.splitlines() if line.strip()]

@@ -123,15 +123,13 @@ class Format(CameraKeys):
 
     files: str = ""  # its files, for the documentation
     told: str | Callable[[Document], object] = ""  # keys at the top of a file, or what tells it
-    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = (
-        _whole_file  # or the path of a list of them
-    )
+    # What finds the trees of the cameras, or the path of a list of them.
+    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = _whole_file
     pose: PoseKeys | Callable[[Parts], Sequence[Pose | None]] | None = None  # keys of it, or what finds all
     unit: str | Callable[[Field], str | None] | None = None  # of lengths, or what finds it in the first tree
     views: Callable[[Field], Mapping[str, Pose]] | None = None  # what finds those of views in the first tree
-    remarks: Mapping[str, str] = field(
-        default_factory=dict
-    )  # if a number is neither 0 nor 1; {} is the number
+    # Notes by key, for numbers that are neither 0 nor 1; {} is the number.
+    remarks: Mapping[str, str] = field(default_factory=dict)
     finish: Callable[[CameraSet, Parts, Document], CameraSet] | None = None  # what else is to be done
     project: bool = False  # whether the cameras have no pose between them: one is read, or all are alike
     reader: Callable[[Document], CameraSet] | None = None  # in place of all of these
