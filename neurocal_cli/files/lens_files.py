@@ -227,6 +227,8 @@ def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
         if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
             field_of_net["hidden"].fail("two numbers of units")
         topology = Topology(D, int(hidden[0]), int(hidden[1]))
+        if len(net["weights"]) == (older := replace(topology, rich=False)).n_weights:
+            topology = older
         for key, count in (("weights", topology.n_weights), ("precision", topology.n_groups)):
             if len(net[key]) != count:
                 field_of_net[key].fail(f"{count} finite numbers")

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from support.command_line import run
 from support.zoom_laws import FLOOR, between, grid, seen
 
 from neurocal_cli.calibration.zoom.fit import fit_lens
+from neurocal_cli.calibration.zoom.mlfn import Topology
 from neurocal_cli.calibration.zoom.zoom_lens import camera_at
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
@@ -68,6 +70,21 @@ def test_a_lens_file_reads_back_to_the_last_bit(folder: Path) -> None:
     for setting in between(3, 2):
         cameras = [format_calibration(camera_at(which, setting)) for which in (lens, again)]
         assert cameras[0] == cameras[1]
+
+
+def test_a_lens_file_whose_tanh_units_have_no_products_still_reads_back(folder: Path) -> None:
+    lens, topology = read_lens(folder / "lens.yaml"), Topology(2, 1, 1, rich=False)
+    weights = np.random.default_rng(0).normal(size=topology.n_weights)
+    (first, *_), x = lens.members, lens.scaled(between(4, 3))
+    nets = tuple(
+        replace(net, topology=topology, weights=1e-3 * weights, precision=np.ones(topology.n_groups))
+        for net in first.nets.nets
+    )
+    older = replace(lens, members=(replace(first, nets=replace(first.nets, nets=nets)),))
+    write_lens(older, folder / "older.yaml")
+    again = read_lens(folder / "older.yaml")
+    assert format_lens(again) == format_lens(older)
+    np.testing.assert_array_equal(again.members[0].nets.local(x), older.members[0].nets.local(x))
 
 
 def test_the_report_names_the_networks(folder: Path) -> None:

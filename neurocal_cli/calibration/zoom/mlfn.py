@@ -2,12 +2,12 @@
 
 The network has two hidden layers and a linear output. The first layer has one rational unit for each control
 and tanh units of single controls. The tanh units of the second layer take the controls and the first layer.
-The output takes all of them by direct connections, and products of two controls and of their rational units
-(sigma-pi units). A network whose weights under a prior are 0 is a plane:
+The output takes all of them by direct connections, and products of two controls, or units of these in the first
+layer (sigma-pi units). A network whose weights under a prior are 0 is a plane:
 
     h(x) = (1 - x^2) / (1 + tilt x),   tilt = 0.99 tanh(a),
-    z = (x, h(x)),   r = (z, tanh(s x + c)),   g = tanh(U r + b),
-    y = v.g + q.r + z'M z / 2 + o,   M = 0 but between two controls
+    r = (x, h(x), tanh(s x + c)),   g = tanh(U r + b),
+    y = v.g + q.r + r'M r / 2 + o,   M = 0 but between two controls
 
 The rational unit is made for optics. By Newton's formula, image distances and focal lengths are homographic
 functions (A x + B) / (1 + C x) of the positions of groups of glass and of the object's distance. They rise
@@ -64,6 +64,7 @@ class Topology:
     controls: int  # inputs, D
     own: int  # tanh units of the first hidden layer for each control, beside its rational unit
     hidden: int  # units of the second hidden layer, H
+    rich: bool = True  # whether tanh units have products; they had none in files of earlier versions
 
     @property
     def width(self) -> int:
@@ -71,10 +72,16 @@ class Topology:
         return self.controls * (2 + self.own)
 
     @cached_property
+    def source(self) -> NDArray[np.int64]:
+        """(R,) number of the control of each unit in r."""
+        D = self.controls
+        return np.concatenate([np.arange(D), np.arange(D), np.repeat(np.arange(D), self.own)])
+
+    @cached_property
     def pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Indices in r of the two factors of each product."""
-        D = self.controls
-        pairs = [(i, j) for i in range(2 * D) for j in range(i) if i % D != j % D]
+        units = self.width if self.rich else 2 * self.controls
+        pairs = [(i, j) for i in range(units) for j in range(i) if self.source[i] != self.source[j]]
         first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
         return first, second
 
@@ -102,8 +109,7 @@ class Topology:
         D, R, H = self.controls, self.width, self.hidden
         group = np.full(self.n_weights, -1)
         group[self.parts["s"]], group[self.parts["c"]] = 0, 1
-        source = np.concatenate([np.arange(D), np.arange(D), np.repeat(np.arange(D), self.own)])
-        group[self.parts["U"]] = np.tile(2 + source, H)
+        group[self.parts["U"]] = np.tile(2 + self.source, H)
         group[self.parts["b"]], group[self.parts["v"]] = 2 + D, 3 + D
         group[self.parts["q"]] = np.repeat([-1, 5 + D, 4 + D], [D, D, R - 2 * D])
         group[self.parts["a"]], group[self.parts["m"]] = 6 + D, 7 + D
@@ -135,14 +141,13 @@ def respond(topology: Topology, weights: Array, x: Array) -> Array:
 
 def respond_with_jacobian(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array]:
     """Outputs (B, n) and their derivatives by the weights (B, n, P)."""
-    y, r, g = _layers(topology, weights, x)
+    y, r, through, g = _layers(topology, weights, x)
     part, D = topology.parts, topology.controls
     B, n, H = len(weights), len(x), topology.hidden
-    z, rational, own_units = r[:, :, : 2 * D], r[:, :, D : 2 * D], r[:, :, 2 * D :]
+    rational, own_units = r[:, :, D : 2 * D], r[:, :, 2 * D :]
     U = weights[:, part["U"]].reshape(B, H, topology.width)
     by_sum = (1 - g * g) * weights[:, None, part["v"]]  # by the argument of each second-layer unit
-    by_r = by_sum @ U + weights[:, None, part["q"]]
-    by_r[:, :, : 2 * D] += z @ _products(topology, weights)
+    by_r = by_sum @ U + weights[:, None, part["q"]] + through
     by_argument = by_r[:, :, 2 * D :] * (1 - own_units * own_units)
     squashed, inside = np.tanh(weights[:, None, part["a"]]), np.clip(x, -1, 1)
     by_tilt = by_r[:, :, D : 2 * D] * rational * -inside / (1 + _LARGEST_TILT * squashed * inside)
@@ -157,8 +162,8 @@ def respond_with_jacobian(topology: Topology, weights: Array, x: Array) -> tuple
     return y, J
 
 
-def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array]:
-    """Output (B, n), controls and first hidden layer (B, n, R), second hidden layer (B, n, H)."""
+def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array, Array]:
+    """Output (B, n), controls and first hidden layer r and M r (B, n, R), second hidden layer (B, n, H)."""
     part = topology.parts
     B, n, D = len(weights), *x.shape
     tilt = _LARGEST_TILT * np.tanh(weights[:, None, part["a"]])
@@ -169,19 +174,12 @@ def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array,
     r = np.concatenate([np.broadcast_to(x, (B, n, D)), rational, own_units], axis=2)
     U = weights[:, part["U"]].reshape(B, topology.hidden, topology.width)
     g = np.tanh(r @ np.swapaxes(U, 1, 2) + weights[:, None, part["b"]])
-    y = (g @ weights[:, part["v"], None] + r @ weights[:, part["q"], None])[..., 0] + weights[:, part["o"]]
-    if D > 1:
-        z = r[:, :, : 2 * D]
-        y = y + 0.5 * ((z @ _products(topology, weights)) * z).sum(axis=2)
-    return y, r, g
-
-
-def _products(topology: Topology, weights: Array) -> Array:
-    """M (B, 2 D, 2 D), symmetric."""
-    M = np.zeros((len(weights), 2 * topology.controls, 2 * topology.controls))
+    M = np.zeros((B, topology.width, topology.width))
     first, second = topology.pairs
-    M[:, first, second] = M[:, second, first] = weights[:, topology.parts["m"]]
-    return M
+    M[:, first, second] = M[:, second, first] = weights[:, part["m"]]
+    through = r @ M
+    y = (g @ weights[:, part["v"], None] + r @ weights[:, part["q"], None])[..., 0] + weights[:, part["o"]]
+    return y + 0.5 * (through * r).sum(axis=2), r, through, g
 
 
 @frozen_dataclass

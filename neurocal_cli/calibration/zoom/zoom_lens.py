@@ -229,7 +229,7 @@ class ZoomLens(Summarised):
                 f"{describe(self.controls, np.atleast_2d(settings)[bad])}; "
                 "choose a setting in the calibrated range"
             )
-        constants, offsets = _mean_constants([member.constants for member in self.members], self.still)
+        constants, offsets = _mean_constants([member.constants for member in self.members])
         Q = self.tables.normal.S.shape[1] - len(self.names)
         within = np.mean([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0)
         offsets = offsets[:, :Q]
@@ -283,13 +283,9 @@ def _spread(J: Array, covariance: Array, Q: int) -> Array:
     return full @ covariance @ np.swapaxes(full, 1, 2)
 
 
-def _mean_constants(constants: list[Constants], still: bool) -> tuple[Constants, Array]:
+def _mean_constants(constants: list[Constants]) -> tuple[Constants, Array]:
     """Mean of the members' constants and the differences from it (m, 6): theta, omega, t_x, t_y."""
     theta = np.array([c.theta for c in constants])
-    if not still:
-        zero = np.zeros((len(theta), 5))
-        mean = Constants(float(theta.mean()), np.eye(3), np.zeros(2))
-        return mean, np.column_stack([theta - theta.mean(), zero])
     t = np.array([c.t for c in constants])
     R = nearest_rotation(np.mean([c.R for c in constants], axis=0))
     turn = np.array([c.R for c in constants]) @ R.T

@@ -99,20 +99,21 @@ def test_plane_and_rational_unit_are_any_homographic_function(pole: float, side:
     assert y[1] - y[0] == pytest.approx(2e-6 * side / (p - side) ** 2, rel=1e-2)
 
 
-def test_products_are_of_different_controls() -> None:
-    topology = Topology(2, 1, 1)
-    x = np.random.default_rng(0).uniform(-1, 1, (7, 2))
-    m = np.array([0.3, -0.7, 1.1, 0.4])
-    rational = 1 - x * x
-    z = np.column_stack([x, rational])
-    assert {tuple(sorted(pair)) for pair in zip(*topology.pairs, strict=True)} == {
-        (0, 1),
-        (0, 3),
-        (1, 2),
-        (2, 3),
-    }
-    y = sum(w * z[:, i] * z[:, j] for w, i, j in zip(m, *topology.pairs, strict=True))
-    np.testing.assert_allclose(respond(topology, network(topology, m=m), x)[0], y, rtol=1e-13)
+@pytest.mark.parametrize(
+    ("rich", "among"),
+    [
+        (True, {(i, j) for i in range(6) for j in range(i, 6) if (i + j) % 2}),
+        (False, {(0, 1), (0, 3), (1, 2), (2, 3)}),
+    ],
+)
+def test_products_are_of_different_controls(rich: bool, among: set[tuple[int, int]]) -> None:
+    topology = Topology(2, 1, 1, rich)
+    rng = np.random.default_rng(0)
+    x, m, s, c = (rng.uniform(-1, 1, shape) for shape in ((7, 2), len(among), 2, 2))
+    units = np.column_stack([x, 1 - x * x, np.tanh(s * x + c)])
+    assert {tuple(sorted(pair)) for pair in zip(*topology.pairs, strict=True)} == among
+    y = sum(w * units[:, i] * units[:, j] for w, i, j in zip(m, *topology.pairs, strict=True))
+    np.testing.assert_allclose(respond(topology, network(topology, m=m, s=s, c=c), x)[0], y, rtol=1e-13)
     assert Topology(1, 2, 2).pairs[0].size == 0
 
 
