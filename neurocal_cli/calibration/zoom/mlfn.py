@@ -2,7 +2,7 @@
 
 The network has two hidden layers and a linear output. The first layer has one rational unit for each control
 and tanh units of single controls. The tanh units of the second layer take the controls and the first layer.
-The output takes all of them by direct connections, and products of two controls, or units of these in the first
+The output takes all of them by direct connections, and products of two controls or their units of the first
 layer (sigma-pi units). A network whose weights under a prior are 0 is a plane:
 
     h(x) = (1 - x^2) / (1 + tilt x),   tilt = 0.99 tanh(a),

@@ -128,6 +128,29 @@ def test_errors_are_as_large_as_their_std_says() -> None:
 
 
 @pytest.mark.slow
+def test_so_they_are_with_outliers_and_a_camera_of_few_views() -> None:
+    errors, of_few = [], []
+    for seed in range(24):
+        if seed % 4 == 3:  # cameras that face each other in two groups
+            continue
+        truth, points = scene(("ring", "line", "star")[seed % 4], 6, 60, seed=900 + seed)
+        rng = np.random.default_rng(seed)
+        for name, one in points.items():
+            if name == "cam3":
+                kept = rng.choice(one.view_names, max(4, one.n_views // 10), replace=False)
+                one = one.select(np.isin(one.view_names, kept)[one.view_index])
+            pixels, n = one.pixels.copy(), len(one)
+            wrong, angle, off = rng.random(n) < 0.02, rng.uniform(0, 2 * np.pi, n), rng.uniform(3, 60, n)
+            pixels[wrong] += (off[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))[wrong]
+            points[name] = replace(one, pixels=pixels)
+        rig = calibrate_rig(points, skew=False, distortion="k1k2", target="given")
+        errors.append(errors_over_std(rig, truth))
+        of_few.append(errors[-1][[*range(12, 18), *range(-12, -8)]])
+    for found in (errors, of_few):
+        assert 0.9 < np.sqrt((np.concatenate(found) ** 2).mean()) < 1.1
+
+
+@pytest.mark.slow
 def test_few_clean_rigs_are_accused() -> None:
     accused = 0
     for seed in range(60):
