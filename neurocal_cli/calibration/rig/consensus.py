@@ -35,8 +35,7 @@ _MOST_HYPOTHESES = 200  # offers that are tried
 # repeat that faults are found and sound pairs kept.
 _SHARE = 0.1
 _SIGMAS = 30.0
-HYPOTHESES = 40
-"""Most pairs of which each is tried as the one that is right."""
+_HYPOTHESES = 40  # most pairs of which each is tried as the one that is right
 _EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
 _LIMITS = np.array([0.5, 1.0]) * _EXCHANGED  # which are tried for pairs from some frame on
 _NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
@@ -173,7 +172,7 @@ class _Poses:
     def rigs(self) -> tuple[Array, Array]:
         """R and t of single pairs, for an even choice of the pairs."""
         n = len(self.R[0])
-        some = np.linspace(0, n - 1, min(n, HYPOTHESES)).astype(int)
+        some = np.linspace(0, n - 1, min(n, _HYPOTHESES)).astype(int)
         R = self.R[1][some] @ np.swapaxes(self.R[0][some], 1, 2)
         return R, self.m[1][some] - (R @ self.m[0][some][..., None])[..., 0]
 

@@ -23,7 +23,6 @@ from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA, along, seen_by
 from neurocal_cli.calibration.rig.consensus import (
     EXCHANGED,
-    HYPOTHESES,
     LEAST_AGREED,
     NEIGHBOUR,
     OPPOSITE,
@@ -115,47 +114,31 @@ def relative_poses(problem: RigProblem, rig: Pose) -> RelativePoses | None:
 
 
 def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Find the pairs that contradict most of the used ones, (P,) bool; none where there is no majority."""
+    """Find the pairs that contradict most of the used ones, (P,) bool; none where there is no majority.
+
+    The half of the pairs that is nearest to its own rig is sought from the rig of the consensus.
+    """
     none = np.zeros(len(poses.offset), dtype=bool)
     places = np.flatnonzero(used)
     if len(places) < 3:
         return none
-    starts = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), HYPOTHESES)).astype(int))]
-    best, lowest = none, np.inf
-    for start in starts:
-        total, core = _concentrated(poses, places, start)
-        if total < lowest:
-            best, lowest = core, total
+    solved = solve_scaled(poses.covariance, poses.offset[..., None])[..., 0]
+    best, distance = none, (poses.offset * solved).sum(axis=1)
     for _ in range(_STEPS):
+        nearest = none.copy()
+        nearest[places[np.argsort(distance[places], kind="stable")[: len(places) // 2 + 1]]] = True
+        if (nearest == best).all():
+            break
+        best = nearest
         distance = _predicted(poses, best)
+    for _ in range(_STEPS):
         limit = SUSPECT * max(1.0, float(median(distance[places])) / MEDIAN)
         odd = used & (distance > limit) & (distance > _OWN_SHARE * poses.n_equations)
         if (best == (used & ~odd)).all():
             break
         best = used & ~odd
+        distance = _predicted(poses, best)
     return odd if 2 * odd.sum() < len(places) else none
-
-
-def _concentrated(
-    poses: RelativePoses, places: NDArray[np.intp], start: int
-) -> tuple[float, NDArray[np.bool_]]:
-    """The half of the pairs that is nearest to its own rig, and the sum of its squared distances from it.
-
-    The search begins with the pairs nearest to one of them, and ends when the half stays the same.
-    """
-    half = len(places) // 2 + 1
-    apart = poses.offset - poses.offset[start]
-    together = poses.covariance + poses.covariance[start]
-    distance = np.asarray((apart * np.linalg.solve(together, apart[..., None])[..., 0]).sum(axis=1))
-    core = np.zeros(len(poses.offset), dtype=bool)
-    for _ in range(_STEPS):
-        nearest = np.zeros_like(core)
-        nearest[places[np.argsort(distance[places], kind="stable")[:half]]] = True
-        if (nearest == core).all():
-            break
-        core = nearest
-        distance = _predicted(poses, core)
-    return float(np.sort(distance[places])[:half].sum()), core
 
 
 def _predicted(poses: RelativePoses, core: NDArray[np.bool_]) -> Array:
