@@ -175,7 +175,9 @@ def calibrate(
 
         several, told = arranged({camera_name: points}, target, fitted, lambda found: {camera_name: found})
         return replace(several, warnings=(*told, *several.warnings))
-    known_target = replace(target, bends=None) if isinstance(target, Target) else None
+    known_target = target if isinstance(target, Target) else None
+    if known_target is not None and known_target.bends is not None:
+        known_target = replace(known_target, bends=None)
     choice = "given" if isinstance(target, Target) else target
     _check_options(method, trainer, distortion, outliers, choice, starts, seed, preferred)
     angle = _angle_of(skew, square_pixels, method, distortion)

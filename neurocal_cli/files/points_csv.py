@@ -19,7 +19,7 @@ from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.table import Table, read_table
 from neurocal_cli.files.table_header import Schema, quoted_field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.observations.labels import first_moved
+from neurocal_cli.observations.labels import most_moved
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.separate_boards import by_board, parts_of
 
@@ -108,7 +108,7 @@ def read_points(
 
 def ids_at_two_places(points: Correspondences) -> list[str]:
     """A note on an id with different X,Y,Z in two views, which is right for several targets only."""
-    moved = None if points.point is None else first_moved(points.world, np.asarray(points.point))
+    moved = None if points.point is None else most_moved(points.world, np.asarray(points.point))
     if moved is None or points.point is None:
         return []
     places = [f"({', '.join(f'{x:g}' for x in points.world[row])})" for row in moved]

@@ -53,16 +53,14 @@ def first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] 
     return None
 
 
-def first_moved(world: Array, ids: NDArray[Any]) -> tuple[int, int] | None:
-    """Find the first row whose id had another place before, and the first row of that id, if there is one."""
+def most_moved(world: Array, ids: NDArray[Any]) -> tuple[int, int] | None:
+    """Find the row that is farthest from the first one of its id, and that one; None if all are there."""
     hashes = _hashes(np.zeros(len(ids), dtype=np.int64), ids.astype(str, copy=False))
     _, first, point = np.unique(hashes, return_index=True, return_inverse=True)
     earlier = first[point.reshape(-1)]
-    moved = np.abs(world - world[earlier]).max(axis=1) > _SAME_PLACE * np.ptp(world, axis=0).max()
-    if not moved.any():
-        return None
-    row = int(np.argmax(moved))
-    return row, int(earlier[row])
+    apart = np.abs(world - world[earlier]).max(axis=1)
+    row = int(np.argmax(apart))
+    return (row, int(earlier[row])) if apart[row] > _SAME_PLACE * np.ptp(world, axis=0).max() else None
 
 
 def _hashes(view: NDArray[np.int64], ids: NDArray[np.str_]) -> NDArray[np.uint64]:

@@ -121,24 +121,7 @@ def cameras_on_one_target(
         if [camera.distortion_model for camera in cameras] == models:
             break
     kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
-    return SeveralCameras(dict(zip(names, _with_one_target(cameras), strict=True)), kept)
-
-
-def _with_one_target(cameras: Sequence[Calibration]) -> list[Calibration]:
-    """The cameras, holding one target where theirs are equal."""
-    first = cameras[0].target
-    return [
-        replace(camera, target=first) if first is not None and _is_equal(first, camera.target) else camera
-        for camera in cameras
-    ]
-
-
-def _is_equal(one: Target, other: Target | None) -> bool:
-    return (
-        other is not None
-        and np.array_equal(one.given, other.given)
-        and np.array_equal(one.found, other.found)
-    )
+    return SeveralCameras(dict(zip(names, cameras, strict=True)), kept)
 
 
 def _likely_models(cameras: Sequence[Calibration]) -> list[tuple[int, str]]:

@@ -17,7 +17,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.calibration.calibrate import fit_poses
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
 from neurocal_cli.calibration.evaluation import (
     GivenPoints,
@@ -319,8 +319,7 @@ class _Evaluator:
         for side, (camera, points) in enumerate(zip(self.cameras, self.points, strict=True)):
             names = {pair[side] for pair in self.new}
             rows = np.array([name in names for name in points.view_names])[points.view_index]
-            new, seed = points.select(rows), camera.seed
-            fit = calibrate(new, type=3, intrinsics=camera, seed=seed, outliers="keep", target="given")
+            fit = fit_poses(points.select(rows), camera, camera.seed)
             new_warnings = [text for text in fit.warnings if text not in self.warnings]
             self.warnings += [f"fitting the poses of new views: {text}" for text in new_warnings]
             if not fit.converged:

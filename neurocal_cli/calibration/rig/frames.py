@@ -27,7 +27,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import planes_are_named
-from neurocal_cli.observations.labels import first_moved
+from neurocal_cli.observations.labels import most_moved
 from neurocal_cli.observations.points import Correspondences
 
 _ANY_CAMERA = r"cam(?:era)?[ _-]?[0-9]+(?![0-9])|left|right"
@@ -161,7 +161,7 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
         )
     pairs = Pairs(rows[0][first], rows[1][second], common // n_codes)
     if by_id:
-        _refuse_moved(left, right, pairs)
+        _refuse_moved({"left": left, "right": right})
     return pairs
 
 
@@ -196,23 +196,6 @@ def _refuse_repeated(points: Correspondences, rows: NDArray[np.intp], keys: NDAr
         f"{points.place(second)}: the point is at the same X, Y, Z (in the same view) as "
         f"{points.place(first)}; remove one of the rows, or give a column point with an id of each point in "
         "both files"
-    )
-
-
-def _refuse_moved(left: Correspondences, right: Correspondences, pairs: Pairs) -> None:
-    """Refuse ids of different places in the two files."""
-    a, b = left.world[pairs.left], right.world[pairs.right]
-    apart = np.abs(a - b).max(axis=1)
-    size = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))
-    if not apart.max() > _SAME_PLACE * size:
-        return
-    row = int(np.argmax(apart))
-    assert left.point is not None
-    name = str(left.point[pairs.left[row]])
-    places = [f"({', '.join(f'{x:g}' for x in places[row])})" for places in (a, b)]
-    raise InputError(
-        f"{right.place(int(pairs.right[row]))}: the point {name[:60]!r} is at {places[1]}, but "
-        f"at {places[0]} in {left.source}; use one board and one unit for both cameras"
     )
 
 
@@ -315,26 +298,28 @@ def check_one_target(points: Mapping[str, Correspondences]) -> None:
                 f"cameras {before} and {name} have the same points ({reference.source}, {one.source}); "
                 "give the points of each camera once"
             )
+    _refuse_moved(points)
+
+
+def _refuse_moved(points: Mapping[str, Correspondences]) -> None:
+    """Refuse ids of different places in different cameras."""
     if any(one.point is None for one in points.values()):
         return
     ids = np.concatenate([np.asarray(one.point).astype(str) for one in points.values()])
-    moved = first_moved(np.concatenate([one.world for one in points.values()]), ids)
+    moved = most_moved(np.concatenate([one.world for one in points.values()]), ids)
     if moved is None:
         return
-    starts = np.cumsum([0, *(len(one) for one in points.values())])
-    where = []
+    starts, where = np.cumsum([0, *(len(one) for one in points.values())]), []
     for row in moved:
         camera = int(np.searchsorted(starts, row, side="right")) - 1
-        name, one = list(points.items())[camera]
-        own = int(row - starts[camera])
-        where.append((name, one.place(own), one.world[own], str(np.asarray(one.point)[own])))
-    (name, place, world, label), (other, _, world_before, _) = where
-    if name == other:
+        where.append((list(points.values())[camera], row - int(starts[camera])))
+    (one, own), (other, _) = where
+    if one is other:
         return  # several targets in one file, as for a single camera
-    at = [f"({', '.join(f'{x:g}' for x in xyz)})" for xyz in (world, world_before)]
+    places = [f"({', '.join(f'{x:g}' for x in some.world[at])})" for some, at in where]
     raise InputError(
-        f"{place}: the point {label[:60]!r} is at {at[0]}, but at {at[1]} in the points of camera {other}; "
-        "use one board and one unit for all cameras"
+        f"{one.place(own)}: the point {str(ids[moved[0]])[:60]!r} is at {places[0]}, but at {places[1]} in "
+        f"{other.source}; use one board and one unit for all cameras"
     )
 
 

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.calibrate import calibrate
-from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.calibrate import fit_poses
+from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.evaluation import refuse_another_size
 from neurocal_cli.calibration.rig.frames import check_one_target, match_views
 from neurocal_cli.calibration.rig.many_views import SpacePoints, triangulate_many
@@ -148,10 +148,7 @@ def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
     from neurocal_cli.calibration.rig.calibrate_rig import poses_on_rig, with_poses
 
     usable, _ = with_poses(points)
-    fits: dict[str, Calibration] = {
-        name: calibrate(one, type=3, intrinsics=rig.cameras[name], outliers="keep", target="given")
-        for name, one in usable.items()
-    }
+    fits = {name: fit_poses(one, rig.cameras[name], 0) for name, one in usable.items()}
     views = match_views({name: fit.points.view_names for name, fit in fits.items()})
     return poses_on_rig(rig.poses, fits, views)
 
