@@ -46,6 +46,7 @@ from neurocal_cli.camera.directions import DECENTRED
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.points import Correspondences
@@ -109,20 +110,12 @@ def _farthest(seen: Array) -> float:
     return float(np.tan(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]).clip(max=_STEEPEST).max()))
 
 
-def corner_radius(
-    entries: Array, pixel_centre: Array, pixel_scale: float, size: tuple[int, int] | None
-) -> float:
-    """Distorted radius of the farthest corner in normalised image coordinates; 0 without an image size.
-
-    `entries` (5,) are those of A, normalised by `pixel_centre` and `pixel_scale`; `size` is width and height.
-    """
+def _corner_radius(entries: Array, size: tuple[int, int] | None) -> float:
+    """Distorted radius of the farthest corner of an image of this size; 0 if that is not known."""
     if size is None:
         return 0.0
-    a11, a12, a22, a13, a23 = entries
     u, v = np.meshgrid([0.0, size[0] - 1.0], [0.0, size[1] - 1.0])
-    y = ((v - pixel_centre[1]) / pixel_scale - a23) / a22
-    x = ((u - pixel_centre[0]) / pixel_scale - a13 - a12 * y) / a11
-    return float(np.hypot(x, y).max())
+    return float(np.hypot(*normalised_points(entries.tolist(), u, v)).max())
 
 
 def fisheye_sizes(far: float) -> Array:
@@ -130,14 +123,14 @@ def fisheye_sizes(far: float) -> Array:
     return np.array([share / far**power for _, power, share in _FISHEYE])
 
 
-def open_coefficients(
+def _open_coefficients(
     model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
 ) -> OpenCoefficients | None:
     """Open coefficients of a selected distortion model with coefficients k (K,); None if there are none.
 
     `free` (5 + K,) tells which of A's entries and the coefficients were estimated. `choice` contains the
     candidate models of the selection; it is empty if the user named the model. `reach` is the `radius` of the
-    farthest point, and `corner` the `corner_radius`.
+    farthest point, and `corner` that of the image's farthest corner.
     """
     own = coefficient_names(model)
     wide = model == "fisheye"
@@ -176,7 +169,7 @@ def open_coefficients(
 
 
 def open_at_points(
-    state: CameraState, points: Correspondences, free: NDArray[np.bool_], tried: tuple[str, ...]
+    state: CameraState, points: Correspondences, free: NDArray[np.bool_], tried: Collection[str]
 ) -> OpenCoefficients | None:
     """Open coefficients of a camera in pixels and world units, known from its points; None if there are none.
 
@@ -184,8 +177,8 @@ def open_at_points(
     and the coefficients were estimated, `tried` among which models this one was selected.
     """
     seen = (state.R[points.view_index] @ points.world[..., None])[..., 0] + state.t[points.view_index]
-    corner = corner_radius(state.entries[0], np.zeros(2), 1.0, points.image_size)
-    return open_coefficients(state.model, state.k, free, tried, _farthest(seen), corner)
+    corner = _corner_radius(state.entries[0], points.image_size)
+    return _open_coefficients(state.model, state.k, free, tried, _farthest(seen), corner)
 
 
 @quietly

@@ -16,6 +16,7 @@ import numpy as np
 from neurocal_cli.adjustment.covariance import CovarianceBasis, counting_views, covariance
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import Covariance
+from neurocal_cli.adjustment.problem import translations
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -124,16 +125,13 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     from neurocal_cli.adjustment import open_choices as choices
 
     m = seen.minimum
-    views, state = m.views, m.state
-    corner = choices.corner_radius(
-        state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
-    )
-    richer = choices.open_coefficients(
-        state.model, state.k, m.free, seen.choice, choices.radius(views, state), corner
-    )
+    views, entries = m.views, m.state.entries * m.views.pixel_scale
+    entries[:, 3:] += views.pixel_centre
+    in_pixels = replace(m.state, entries=entries, t=translations(views, m.state))
+    richer = choices.open_at_points(in_pixels, seen.points, m.free, seen.choice)
     if richer is None:
         return known
-    state = richer.state(state)
+    state = richer.state(m.state)
     normal, _ = normal_blocks(views.batches, state)
     m = _basis(seen, replace(m, state=state, normal=normal, free=richer.free)).minimum
     spread = choices.spread_of_open(m.arrow, variance, richer.prior)
