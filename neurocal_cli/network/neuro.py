@@ -14,7 +14,6 @@ together train a single layer, W, with known inputs.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,7 @@ from neurocal_cli.network.local_minima import (
 from neurocal_cli.network.network import Patterns, Task, patterns_of
 from neurocal_cli.network.options import MOST_POINTS, Options
 from neurocal_cli.network.orthogonality import cameras_from_products, candidate_intrinsics
-from neurocal_cli.network.starts import learn
+from neurocal_cli.network.starts import find_camera, find_poses, learn
 from neurocal_cli.network.view_networks import (
     Group,
     begin_flat,
@@ -47,10 +46,6 @@ from neurocal_cli.network.view_networks import (
     refuse_few_conditions,
     train_networks,
 )
-
-if TYPE_CHECKING:
-    from neurocal_cli.network.starts import Found
-
 
 # Repeated by test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
@@ -112,7 +107,7 @@ def _camera_and_poses(problem: Problem, options: Options, rng: np.random.Generat
         # One view: random cameras as well, if equations are scarce or the bound is not reached.
         spare = 2 * int(problem.views.distinct.sum()) - problem.n_parameters
         if spare < _MANY_EQUATIONS or not reaches_bound(problem, best, groups):
-            found = _random_camera(problem, rng, options.starts)
+            found = find_camera(problem.views, problem.normalised_entries, problem.free, rng, options.starts)
             if found is not None:
                 record = replace(record, starts=record.starts + found.starts)
                 best = try_start(problem, best, found.state)
@@ -128,7 +123,8 @@ def _camera_and_poses(problem: Problem, options: Options, rng: np.random.Generat
 
 def _camera_from_few_points(problem: Problem, options: Options, rng: np.random.Generator) -> _Begun:
     """Type 2 with one view of 5 points: random cameras instead of a free product."""
-    found = _random_camera(problem, rng, max(options.starts, _FEW_POINT_STARTS))
+    many = max(options.starts, _FEW_POINT_STARTS)
+    found = find_camera(problem.views, problem.normalised_entries, problem.free, rng, many)
     if found is None:
         raise DegenerateGeometryError(
             f"no random start found a camera for these {len(problem.views.index)} points; give more points"
@@ -223,13 +219,6 @@ def _refined(
     return adjusted, replace(record, before=before)
 
 
-def _random_camera(problem: Problem, rng: np.random.Generator, starts: int) -> Found | None:
-    """Intrinsics and pose of a single view from random cameras."""
-    from neurocal_cli.network.starts import find_camera
-
-    return find_camera(problem.views, problem.normalised_entries, problem.free, rng, starts)
-
-
 def _with_random_poses(
     views: Views,
     state: CameraState,
@@ -242,8 +231,6 @@ def _with_random_poses(
     members = np.flatnonzero(which)
     if not members.size:
         return state, record
-    from neurocal_cli.network.starts import find_poses
-
     found = find_poses(views, members, state.entries, rng, starts)
     R, t = state.R.copy(), state.t.copy()
     R[members], t[members] = found.state.R, found.state.t

@@ -306,31 +306,13 @@ class PointTerms:
     """Sums of products with the derivatives by the target points, for one camera, normalised.
 
     `normal` (V, 12 + K, 12 + K) is as from `normal_blocks`; with bends, it has three columns for them before
-    the residual. The rest is as in `Information`; from `folded_terms`, sums over views have one more axis.
+    the residual. The rest is as in `Information`; sums over views have one more axis, for the folds.
     """
 
     normal: Array
     point: Array
     by_camera: Array
     pose_point: Array
-
-
-def point_terms(
-    batches: PointBatches,
-    state: CameraState,
-    scale: Array,
-    label: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    n_points: int,
-) -> PointTerms:
-    """Sums of one camera over its observations of `n_points` target points.
-
-    `scale` (V,) is S2 of each view, `label` (T, n) is from `labelled`, and `columns` (f,) are those of the
-    camera's free parameters.
-    """
-    fold = np.zeros(batches.n_views, dtype=np.intp)
-    terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1)
-    return replace(terms, point=terms.point[0], by_camera=terms.by_camera[0])
 
 
 def folded_terms(
@@ -345,9 +327,11 @@ def folded_terms(
     shapes: Array | None = None,
     out: Array | None = None,
 ) -> PointTerms:
-    """The same sums over each of `n_folds` folds (V,) of the views; `shapes` is as in `Sight`.
+    """Sums of one camera over its observations of `n_points` target points, for each fold (V,) of its views.
 
-    `out` (V, p, n, 3) are zeros that become those of poses and points.
+    `scale` (V,) is S2 of each view, `label` (T, n) is from `labelled`, and `columns` (f,) are those of the
+    camera's free parameters; `shapes` is as in `Sight`. `out` (V, p, n, 3) are zeros that become those of
+    poses and points.
     """
     f, V, by_batch = len(columns), batches.n_views, blocks_by_batch(batches, state, shapes)
     whole = by_batch.shape[1]

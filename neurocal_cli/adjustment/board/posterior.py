@@ -136,13 +136,17 @@ _NO_COST = 1e-300  # lower bound of a cost, which rounding may make negative
 
 def evidence_of_given(*cameras: Information) -> float:
     """Log evidence of the given target, from cameras that share no unknowns."""
-    spare = cost = logdet = 0.0
-    for info in cameras:
-        S, g, least, of_poses = _poses_eliminated(info)
-        spare += info.spare
-        cost += least - (float(g @ np.linalg.solve(S, g)) if len(g) else 0.0)
-        logdet += of_poses + (float(np.linalg.slogdet(S)[1]) if len(g) else 0.0) - info.log_precision
-    return log_evidence(spare, cost, logdet)
+    parts = [(info.spare, *_as_given(info)[2:]) for info in cameras]
+    return log_evidence(*(sum(part) for part in zip(*parts, strict=True)))
+
+
+def _as_given(info: Information) -> tuple[Array, Array, float, float]:
+    """Covariance of the cameras for unit noise, their step, the cost and the log determinant of all."""
+    S, g, cost, of_poses = _poses_eliminated(info)
+    inverse = np.asarray(np.linalg.inv(S), dtype=float)
+    step = inverse @ g
+    logdet = of_poses + float(np.linalg.slogdet(S)[1]) - info.log_precision
+    return inverse, step, cost - float(g @ step), logdet
 
 
 def camera_step_of(info: Information) -> Array:
@@ -208,15 +212,12 @@ def posterior(
 
 def given_posterior(info: Information, prior: Prior) -> Posterior:
     """The posterior with zero offsets: the points stay as given."""
-    S, g, cost, logdet = _poses_eliminated(info)
-    inverse = np.linalg.inv(S)
-    cost -= float(g @ inverse @ g)
-    logdet += float(np.linalg.slogdet(S)[1]) - info.log_precision
+    inverse, step, cost, logdet = _as_given(info)
     return Posterior(
         offsets=np.zeros((len(prior.axes), 3)),
         variance=cost / info.spare,
-        camera_step=inverse @ g,
-        camera=np.asarray(inverse, dtype=float),
+        camera_step=step,
+        camera=inverse,
         sizes=dict.fromkeys(prior.names, NOTHING * prior.size),
         determined=0.0,
         evidence=log_evidence(info.spare, cost, logdet),

@@ -26,12 +26,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.information import Information, labelled, point_terms
+from neurocal_cli.adjustment.board.information import Information, folded_terms, labelled
 from neurocal_cli.adjustment.board.posterior import known_sizes
-from neurocal_cli.adjustment.board.prior import prior_of_target
+from neurocal_cli.adjustment.board.prior import Prior, prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
-from neurocal_cli.adjustment.normal_equations import Covariance, eliminate, solve_scaled
+from neurocal_cli.adjustment.normal_equations import Covariance, solve_scaled
 from neurocal_cli.adjustment.open_choices import (
     OpenCoefficients,
     OpenPrior,
@@ -72,9 +72,10 @@ def covariance_over_frames(fit: RigFit) -> Array:
     """
     problem, free = fit.problem, np.flatnonzero(fit.free)
     views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
-    reduced, _ = fit.normal.reduced()
-    inverse = solve_scaled(reduced[np.ix_(free, free)], np.eye(len(free)))
-    step = inverse @ reduced[free, -1]  # to the minimum, if the cameras were not refined
+    arrow = fit.normal.only(free)
+    reduced, solved = arrow.reduced()
+    inverse = solve_scaled(reduced[:-1, :-1], np.eye(len(free)))
+    step = inverse @ reduced[:-1, -1]  # to the minimum, if the cameras were not refined
     # Of each column among the free ones; the residual comes after them.
     number = np.full(len(fit.free) + 1, -1)
     number[free], number[-1] = np.arange(len(free)), len(free)
@@ -87,26 +88,23 @@ def covariance_over_frames(fit: RigFit) -> Array:
         seen = np.zeros(len(free) + 1, dtype=bool)
         for place, _ in parts:
             seen[place[place >= 0]] = True
-        m, local = int(seen.sum()), np.cumsum(seen) - 1
-        N = np.zeros((m + 6, m + 6))
+        local = np.cumsum(seen) - 1
+        left = -arrow.cross[k][:, seen].T @ solved[k][:, seen]
         for place, M in parts:
-            kept = np.append(place >= 0, np.ones(6, dtype=bool))
-            at = np.append(local[place[place >= 0]], m + np.arange(6))
-            N[np.ix_(at, at)] += M[np.ix_(kept, kept)]
-        left, _ = eliminate(N, np.arange(m), m + np.arange(6))
+            kept = np.flatnonzero(place >= 0)
+            at = local[place[kept]]
+            left[np.ix_(at, at)] += M[np.ix_(kept, kept)]
         columns, S = np.flatnonzero(seen[:-1]), left[:-1, :-1]
         g, G = left[:-1, -1] - S @ step[columns], inverse[:, columns]
-        x = solve_scaled(np.eye(m - 1) - G[columns] @ S, -(G[columns] @ g)[:, None])[:, 0]
+        x = solve_scaled(np.eye(len(S)) - G[columns] @ S, -(G[columns] @ g)[:, None])[:, 0]
         moves[k] = G @ (S @ x - g)
     return jackknife(moves[np.isfinite(moves).all(axis=1)])
 
 
 def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     """(F, F) covariance of the free shared parameters of the rig; None if they are not determined."""
-    prior = prior_of_target(target)
-    info = information_of_rig(target, fit).turned(prior.axes)
-    variance = info.cost / max(info.spare, 1.0)
-    info = info.around_given(prior.along_axes(target.offsets))
+    info, prior = information_of_rig(target, fit)
+    variance = fit.cost / max(info.spare, 1.0)
     try:
         if prior.stated is not None:
             variance = noise_variance(info, prior, target.sizes["stated"])
@@ -116,8 +114,11 @@ def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     return found.variance * found.camera
 
 
-def information_of_rig(target: Target, fit: RigFit) -> Information:
-    """The quadratic in the found target's points, the free shared unknowns and the poses."""
+def information_of_rig(target: Target, fit: RigFit) -> tuple[Information, Prior]:
+    """The quadratic in the whole offsets, along each point's axes, the free shared unknowns and the poses.
+
+    The second result is the prior of the offsets.
+    """
     problem, state, n = fit.problem, fit.state, len(target.given)
     columns, shared = state.columns, np.flatnonzero(fit.free)
     point, by_shared = np.zeros((n, 3, 3)), np.zeros((n, 3, columns.n_shared + 1))
@@ -126,15 +127,18 @@ def information_of_rig(target: Target, fit: RigFit) -> Information:
         views = observed.views
         label = labelled(views, target.rows_of(views.world))
         camera, shared_columns = problem.camera(state, side), camera_columns(len(own) - 5)
-        terms = point_terms(views.batches, camera, views.scale, label, shared_columns, n)
+        one_fold = np.zeros(views.n_views, dtype=np.intp)
+        terms = folded_terms(views.batches, camera, views.scale, label, shared_columns, n, one_fold, 1)
         w, (of_rig, by_rig, by_pose) = observed.weight, problem.pose_steps(state, side)
-        point += w * terms.point
-        by_shared[:, :, np.append(own, -1)] += w * terms.by_camera
+        point += w * terms.point[0]
+        by_shared[:, :, np.append(own, -1)] += w * terms.by_camera[0]
         by_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", terms.pose_point, by_rig)
         pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, by_pose)
     equations = sum(observed.views.n_equations for observed in problem.observations)
     by_shared = by_shared[:, :, np.append(shared, -1)]
-    return Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
+    info = Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
+    prior = prior_of_target(target)
+    return info.turned(prior.axes).around_given(prior.along_axes(target.offsets)), prior
 
 
 def with_choice(found: Covariance, fit: RigFit) -> Covariance:

@@ -16,7 +16,7 @@ import numpy as np
 from neurocal_cli.adjustment.covariance import not_smaller
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, rig_problem, scatter
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.causes import TAKEN
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, with_agreeing_poses
@@ -99,7 +99,7 @@ def fit_rig(
     target = cameras[names[0]].target
     common = target is not None and all(camera.target is target for camera in cameras.values())
     if target is not None and common:
-        fit = with_board(fit, target, lambda within, start: adjust_rig(within, start, fit.free))
+        fit = with_board(fit, target)
         target = fit.problem.calibrations[0].target
     found = _covariance(fit, target if common else None)
     stretched = 0.0

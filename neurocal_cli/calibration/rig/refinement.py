@@ -7,13 +7,13 @@ shape with all other unknowns of the rig, moves the points there, and adjusts th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.adjustment.board.posterior import minimum_of
-from neurocal_cli.adjustment.board.prior import nearest_to_given, prior_of_target
+from neurocal_cli.adjustment.board.prior import nearest_to_given
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.monotonic_fit import ROUNDS, TIE, next_penalty, told_of_fold
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, free_parameters, rig_problem
@@ -73,18 +73,17 @@ def _monotonic(fit: RigFit) -> RigFit:
     return fit
 
 
-def with_board(fit: RigFit, target: Target, adjusted: Callable[[RigProblem, RigState], RigFit]) -> RigFit:
+def with_board(fit: RigFit, target: Target) -> RigFit:
     """The fit at the common minimum of the target's shape and all other unknowns, on the moved target.
 
-    `adjusted` is the common adjustment of a problem from a state near its minimum. The fit stays as it is
-    where the points do not determine the shape.
+    It stays as it is where the points do not determine the shape.
     """
     for _ in range(_ROUNDS):
         moved = _moved(target, fit)
         if moved is None:
             return fit
         move = moved.moved_from(target)
-        fit, target = _on_target(fit, target, moved, adjusted), moved
+        fit, target = _on_target(fit, target, moved), moved
         if move < _SETTLED:
             return fit
     return fit
@@ -92,8 +91,7 @@ def with_board(fit: RigFit, target: Target, adjusted: Callable[[RigProblem, RigS
 
 def _moved(target: Target, fit: RigFit) -> Target | None:
     """The most probable target, all other unknowns following it; None if it is not determined."""
-    prior = prior_of_target(target)
-    info = information_of_rig(target, fit).turned(prior.axes).around_given(prior.along_axes(target.offsets))
+    info, prior = information_of_rig(target, fit)
     try:
         _, offsets = minimum_of(info, prior, target.sizes, fit.variance)
     except np.linalg.LinAlgError:
@@ -107,9 +105,7 @@ def _moved(target: Target, fit: RigFit) -> Target | None:
     return replace(target, found=held * (s * world @ R.T + t))
 
 
-def _on_target(
-    fit: RigFit, before: Target, after: Target, adjusted: Callable[[RigProblem, RigState], RigFit]
-) -> RigFit:
+def _on_target(fit: RigFit, before: Target, after: Target) -> RigFit:
     """The fit with its points on another target."""
 
     def on_it(camera: Calibration) -> Calibration:
@@ -123,4 +119,4 @@ def _on_target(
     state = fit.state
     turned: Array = (state.view_R @ (new.centre - old.centre)[..., None])[..., 0]
     view_t = (state.view_t * old.scale[:, None] + turned) / new.scale[:, None]
-    return adjusted(new, replace(state, t=state.t * (old.unit / new.unit), view_t=view_t))
+    return adjust_rig(new, replace(state, t=state.t * (old.unit / new.unit), view_t=view_t), fit.free)
