@@ -43,13 +43,9 @@ from neurocal_cli.adjustment.cross_validation import (
     quietly,
     solve_or_nan,
 )
-from neurocal_cli.adjustment.normal_equations import Covariance, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import Arrowhead, Covariance, unit_diagonal
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import (
-    camera_columns,
-    normal_blocks,
-    pose_response,
-)
+from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
@@ -110,8 +106,8 @@ def covariance_by_camera(views: Views, state: CameraState, entries: Array) -> Ar
     `entries` (5 + K, 5 + K) is as from `entry_covariance`, and `state` is normalised and at its minimum.
     """
     normal, _ = normal_blocks(views.batches, state)
-    gain = pose_response(normal, camera_columns(state.k.shape[-1]))
-    return np.asarray(gain @ entries @ np.swapaxes(gain, 1, 2))
+    follow = Arrowhead.of(normal, camera_columns(state.k.shape[-1]), POSE_COLUMNS).follow
+    return np.asarray(follow @ entries @ np.swapaxes(follow, 1, 2))
 
 
 def parameter_covariance(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.views import PointBatches, Views, products
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
@@ -31,11 +30,6 @@ def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
 def free_columns(free: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Columns (f,) of the shared parameters that are free (5 + K,)."""
     return camera_columns(len(free) - 5)[np.flatnonzero(free)]
-
-
-def pose_response(normal: Array, columns: NDArray[np.intp]) -> Array:
-    """(V, 6, f) how the poses follow the parameters with these columns (f,), with the opposite sign."""
-    return solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2))
 
 
 def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:

@@ -25,10 +25,23 @@ from neurocal_cli.errors import InputError
 _LEAST_NOISE = 0.1  # of a camera's pixels over that of all; fewer points may fit better by chance
 
 
+@frozen_dataclass(eq=False)
 class FixedCameras(Presented):
-    """Cameras that are fixed to each other: their verdict, and what they measure in space."""
+    """Cameras that are fixed to each other: how well they fit, their verdict, what they measure in space."""
 
-    judgement: Any  # Verdict, the function that computes it from this rig, or None
+    timed: bool = field(default=False, kw_only=True)
+    rmse_px: float = field(default=float("nan"), kw_only=True)
+    max_px: float = field(default=float("nan"), kw_only=True)
+    converged: bool = field(default=True, kw_only=True)
+    stop_reason: str = field(default="", kw_only=True)
+    iterations: int = field(default=0, kw_only=True)
+    warnings: tuple[str, ...] = field(default=(), kw_only=True)
+    judgement: Verdict | Callable[[Any], Verdict | None] | None = field(default=None, kw_only=True)
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the pixels of the calibration, in u and in v [px]."""
+        return self.rmse_px / float(np.sqrt(2.0))
 
     @cached_property
     def verdict(self) -> Verdict | None:
@@ -89,14 +102,6 @@ class StereoRig(FixedCameras):
     pairs: tuple[tuple[str, str], ...]
     left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
     delay: tuple[float, float] | None = None
-    timed: bool = False
-    rmse_px: float = float("nan")
-    max_px: float = float("nan")
-    converged: bool = True
-    stop_reason: str = ""
-    iterations: int = 0
-    warnings: tuple[str, ...] = ()
-    judgement: Verdict | Callable[[StereoRig], Verdict | None] | None = None
 
     _summary = ("commands.show.rig_report", "stereo_report")
 
@@ -159,11 +164,6 @@ class StereoRig(FixedCameras):
         return np.asarray(F / np.linalg.norm(F))
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation of the pixels of the calibration, in u and in v [px]."""
-        return self.rmse_px / float(np.sqrt(2.0))
-
-    @property
     def unit(self) -> str:
         """Unit of the world coordinates."""
         return self.left.unit
@@ -213,14 +213,6 @@ class Rig(FixedCameras):
     frames: Mapping[str, Mapping[str, str]]
     left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
     delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    timed: bool = False
-    rmse_px: float = float("nan")
-    max_px: float = float("nan")
-    converged: bool = True
-    stop_reason: str = ""
-    iterations: int = 0
-    warnings: tuple[str, ...] = ()
-    judgement: Verdict | Callable[[Rig], Verdict | None] | None = None
 
     _summary = ("commands.show.rig_report", "rig_report")
 
@@ -250,11 +242,6 @@ class Rig(FixedCameras):
     def unit(self) -> str:
         """Unit of the world coordinates."""
         return self.cameras[self.first].unit
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of the pixels of the calibration, in u and in v [px]."""
-        return self.rmse_px / float(np.sqrt(2.0))
 
     @property
     def noise_shares(self) -> Array:
@@ -382,7 +369,7 @@ def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:
         {a: {left: a, right: b} for a, b in rig.pairs},
         left_out,
         {} if rig.delay is None else {right: rig.delay},
-        rig.timed,
+        timed=rig.timed,
         rmse_px=rig.rmse_px,
         max_px=rig.max_px,
         converged=rig.converged,
