@@ -2,7 +2,7 @@
 
 The ellipses are the outlines of adaptive thresholds. The centres of both kinds of grids form a lattice; those
 of an asymmetric one stand on their corners. From a start in the middle, neighbours are added where those
-before them predict them. The lattice then is compared with the board in all ways that keep its handedness.
+around them predict them. The lattice then is compared with the board in all ways that keep its handedness.
 Perspective may make other vectors shorter than those of the rows, so the basis may be sheared.
 
 A round thing beside the board may look like one of its circles, and change which part of the board seems to
@@ -12,7 +12,6 @@ of the board.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from itertools import product
 from typing import Any
@@ -24,6 +23,8 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.appearance import are_circles
+from neurocal_cli.detection.finding.grow import frontier
+from neurocal_cli.detection.finding.lattice import predict_vertices
 from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
 from neurocal_cli.detection.placement import NoBoardError
@@ -180,9 +181,8 @@ def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) ->
     return np.asarray(image[y, x] < median - _STEPS[0])
 
 
-_ALIKE = 2.2  # greatest ratio of the areas of neighbours
+_ALIKE = 2.2  # greatest ratio of the areas of circles on the board
 _NEAR = 0.3  # of the shorter step; distance between prediction and circle
-_GROWTH = 1.5  # greatest ratio of two steps
 _SLANT = 0.35  # least sine of the angle between the steps at the start
 _STARTS = 30  # blobs that are tried as a start
 _FEWEST = 9  # circles
@@ -262,64 +262,36 @@ def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
 
 
 def _grown(blobs: Blobs, away: Array, start: int) -> dict[tuple[int, int], int]:
-    """The lattice around a blob."""
+    """The lattice around a blob, layer by layer, where those around a place predict a circle of its size."""
     steps = _steps(blobs, away, start)
     if steps is None:
         return {}
-    place = {(0, 0): start}
-    used = {start}
-    local = {(0, 0): steps}
-    queue = deque([(0, 0)])
-    while queue:
-        i, j = queue.popleft()
-        here, (a, b) = blobs.centre[place[i, j]], local[i, j]
-        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            new = i + di, j + dj
-            if new in place:
-                continue
-            step = di * a + dj * b
-            off = np.hypot(*(blobs.centre - here - step).T)
-            k = int(off.argmin())
-            ratio = blobs.area[k] / blobs.area[place[i, j]]
-            if (
-                k in used
-                or off[k] > _NEAR * min(np.hypot(*a), np.hypot(*b))
-                or not 1 / _ALIKE < ratio < _ALIKE
-            ):
-                continue
-            place[new] = k
-            used.add(k)
-            local[new] = _local_steps(blobs, place, new, (a, b))
-            queue.append(new)
-    return place
+    centre, size = blobs.centre, blobs.area[start] / abs(float(np.linalg.det(steps)))
+    at = np.full((3, 3), -1)
+    at[1, 1] = start
+    for place, step in zip(((1, 2), (1, 0), (2, 1), (0, 1)), np.repeat(steps, 2, axis=0), strict=True):
+        way = 1 if max(place) == 2 else -1
+        at[place] = np.hypot(*(centre - centre[start] - way * step).T).argmin()
+    while True:
+        at = np.pad(at, 1, constant_values=-1)
+        row, col, _ = frontier(at >= 0, 1)
+        predicted = predict_vertices(np.where(at[..., None] >= 0, centre[at], np.nan), row, col)
+        off = np.hypot(*(centre[:, None] - predicted.points).transpose(2, 0, 1))
+        near = off.argmin(axis=0)
+        room = _NEAR * np.hypot(predicted.steps[..., 0], predicted.steps[..., 1]).min(axis=1)
+        ratio = blobs.area[near] / np.maximum(size * np.abs(predicted.area), 1e-9)
+        good = (off.min(axis=0) < room) & (ratio < _ALIKE) & (ratio > 1 / _ALIKE)
+        good &= ~np.isin(near, at)
+        # Of two places with the same blob, the nearer one has it.
+        order = np.flatnonzero(good)[np.argsort(off.min(axis=0)[good])]
+        new = order[np.unique(near[order], return_index=True)[1]]
+        if not len(new):
+            return {(c, r): int(at[r, c]) for r, c in np.argwhere(at >= 0).tolist()}
+        at[row[new], col[new]] = near[new]
 
 
-def _local_steps(
-    blobs: Blobs, place: dict[tuple[int, int], int], at: tuple[int, int], usual: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """The steps at a place by its neighbours, and by those of the place before it where there are none."""
-    steps = []
-    here = blobs.centre[place[at]]
-    for axis, step in enumerate(usual):
-        unit = np.eye(2, dtype=int)[axis]
-        seen = {k: place.get((at[0] + k * unit[0], at[1] + k * unit[1])) for k in (-2, -1, 1, 2)}
-        ways = []
-        for sign in (1, -1):
-            one, two = seen[sign], seen[2 * sign]
-            if one is None:
-                continue
-            way = sign * (blobs.centre[one] - here)
-            if two is not None and seen[-sign] is None:
-                # Perspective goes on shortening or lengthening the steps.
-                before = np.hypot(*(blobs.centre[two] - blobs.centre[one]))
-                way = way * np.clip(np.hypot(*way) / max(before, 1e-9), 1 / _GROWTH, _GROWTH)
-            ways.append(way)
-        steps.append(np.mean(ways, axis=0) if ways else step)
-    return steps[0], steps[1]
-
-
-def _steps(blobs: Blobs, away: Array, start: int) -> tuple[Array, Array] | None:
-    """The steps from a blob to two neighbours, of which the opposite ones are there too."""
+def _steps(blobs: Blobs, away: Array, start: int) -> Array | None:
+    """The steps (2, 2) from a blob to two neighbours, of which the opposite ones are there too."""
     near = np.argsort(away[start])[:12]
     near = near[np.isfinite(away[start, near])]
     ratio = blobs.area[near] / blobs.area[start]
@@ -335,7 +307,7 @@ def _steps(blobs: Blobs, away: Array, start: int) -> tuple[Array, Array] | None:
             continue
         cross = first[0] * vector[1] - first[1] * vector[0]
         if abs(cross) > _SLANT * length * np.hypot(*first):
-            return (first, vector) if cross > 0 else (first, -vector)
+            return np.stack([first, vector if cross > 0 else -vector])
     return None
 
 
