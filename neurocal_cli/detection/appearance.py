@@ -31,8 +31,9 @@ from neurocal_cli.detection.grid import squares_of, weights_within
 from neurocal_cli.detection.markers.lattice import flattening_of, predicted
 
 _RAYS = 16
-_FIRST, _STEP = 0.3, 0.05  # of the radius, from where on the light is looked at on rings
-_INSIDE, _AROUND = 2, 1.5  # the ring of 0.4, within all marks, and the radius up to which a mark ends
+_FIRST, _STEP = 0.05, 0.05  # of the radius, from where on the light is looked at on rings
+_LEVEL_FROM = 5  # the ring of 0.3; smaller ones have few pixels, so that their light is noisy
+_INSIDE, _AROUND = 7, 1.5  # the ring of 0.4, within all marks, and the radius up to which a mark ends
 _NEXT = 0.54  # of the distance to the next mark, of the last ring
 _BLUR = 2.2  # standard deviations of the blur from the edge to where the paper is blank
 _SHARP = 0.15  # of the radius: of an edge less blurred, a small displacement is a large change of light
@@ -49,9 +50,9 @@ _OFF = 0.05, 0.1  # of the distance to the next mark: from where those around a 
 _INKS = 0.04, 0.25  # rms, of the share of the paper's light from a smooth change (0.02; photographs 0.034)
 _SIZES = 0.05, 0.2  # rms, of the log of the radius from a smooth change (0.01)
 _MIXED = (
-    0.02,
+    0.015,
     0.1,
-)  # rms, of the light by the distance from that of a disc or a ring (0.008; photographs 0.027)
+)  # rms, of the light by the distance from that of a disc or a ring (0.012; photographs 0.027)
 _LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
 _CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
 _SIGNED = (
@@ -85,7 +86,7 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     middle, edge = np.count_nonzero(shares < 1), np.count_nonzero(shares < _AROUND) - 1
     # A ring may be light in its middle.
     profile = np.median(levels[..., :: _RAYS // 4].mean(axis=2), axis=0)
-    inner = int(np.abs(profile[:middle] - profile[edge]).argmax())
+    inner = _LEVEL_FROM + int(np.abs(profile[_LEVEL_FROM:middle] - profile[edge]).argmax())
     outer = middle + int(np.abs(profile[middle : edge + 1] - profile[inner]).argmax())
     ring = np.median(levels, axis=2)
     contrast = ring[:, outer] - ring[:, inner]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -273,13 +273,14 @@ def other_kind(images: Iterable[NDArray[np.generic]], described: Plane) -> str:
     seen = _Seen()
     for image in images:
         seen.add(image, all_kinds=True)
-    if not seen.kind:
+    another_size = type(described) is Plane and described.markers is None  # which each image tells
+    if not seen.kind or (another_size and seen.kind is seen.squares):
         return ""
     try:
         plane = _agreed(seen).plane
     except NoBoardError as error:
         return "" if seen.kind is seen.squares else str(error)
-    if type(plane) is type(described) and (plane.markers is None) == (described.markers is None):
+    if found_words(plane) == found_words(replace(described, markers=plane.markers)):
         return ""
     return f"the image shows {found_words(plane)}; correct the description of the board, or leave it out"
 
