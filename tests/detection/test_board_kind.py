@@ -187,6 +187,7 @@ def test_squares_in_a_grid_are_no_circles(side: int) -> None:
         ("pieces", 205),
         ("polygons", 13),
         ("targets", 142),
+        ("targets", 176),
         ("discs", 145),
     ],
 )
