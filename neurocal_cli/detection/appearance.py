@@ -195,7 +195,7 @@ _ON_RAYS = weights_within(
 )
 _CENTRE = weights_within(0.5 + 0.15 * np.concatenate([[[0, 0]], _TO_SIDES, _TO_CORNERS]))
 _FLAT = 18  # steps from which a square has one level: 0.2 of it
-# Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.013, circles 0.13.
+# Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.02, circles 0.13.
 _ROUNDED, _ROUNDED_PX = 0.025, 0.5
 # Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
 # and 0.1 and more on boards with markers.

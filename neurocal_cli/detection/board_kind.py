@@ -26,7 +26,7 @@ from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, 
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.saddles import grey_levels
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.markers.found import SeenMarkers, agreed_markers, seen_markers
+from neurocal_cli.detection.markers.found import FoundBoard, SeenMarkers, agreed_markers, seen_markers
 from neurocal_cli.detection.placement import End, NoBoardError, board_ends
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import Board, Plane
@@ -177,15 +177,6 @@ _ENOUGH_KINDS = 5  # images of a grid of circles, or of markers that tell all of
 _MOST_MARKED = 12  # images of markers that are examined
 
 
-@frozen_dataclass
-class FoundBoard:
-    """A board that images agree on."""
-
-    plane: Plane  # its square, or tag, or distance of circles has the length 1
-    sure: bool  # whether an image shows all its ends
-    doubts: tuple[str, ...] = ()  # what else it might be, what was taken, and why
-
-
 @frozen_dataclass(eq=False)
 class _Seen:
     """What images show."""
@@ -238,7 +229,7 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
         if is_certain(seen.squares) and seen.kind is seen.squares:
             break
         if len(seen.marked) in (_ENOUGH_KINDS, _MOST_MARKED) and seen.kind is seen.marked:
-            found = _marked(seen)
+            found = agreed_markers(seen.marked)
             if found.sure or len(seen.marked) == _MOST_MARKED:
                 return found
         if sum(one.whole for one in seen.circles) >= _ENOUGH_KINDS and seen.kind is seen.circles:
@@ -260,12 +251,9 @@ def _agreed(seen: _Seen) -> FoundBoard:
     if seen.kind is seen.squares:
         size = agreed_size(seen.squares)
         return FoundBoard(Plane("", *size.size, 1.0), size.sure)
-    return _marked(seen) if seen.kind is seen.marked else FoundBoard(*agreed_circles(seen.circles))
-
-
-def _marked(seen: _Seen) -> FoundBoard:
-    found = agreed_markers(seen.marked)
-    return FoundBoard(found.plane, found.sure, found.doubts)
+    return (
+        agreed_markers(seen.marked) if seen.kind is seen.marked else FoundBoard(*agreed_circles(seen.circles))
+    )
 
 
 def other_kind(images: Iterable[NDArray[np.generic]], described: Plane) -> str:

@@ -77,12 +77,12 @@ class SeenMarkers:
 
 
 @frozen_dataclass
-class FoundPlane:
-    """A board that images agree on, its square or tag of side 1."""
+class FoundBoard:
+    """A board that images agree on."""
 
-    plane: Plane
-    sure: bool  # whether images show that it ends at its first and last row
-    doubts: tuple[str, ...]  # what else it might be, what was taken, and why
+    plane: Plane  # its square, or tag, or distance of circles has the length 1
+    sure: bool  # whether an image shows all its ends; of markers, its first and last row
+    doubts: tuple[str, ...] = ()  # what else it might be, what was taken, and why
 
 
 def seen_markers(image: NDArray[np.generic]) -> tuple[SeenMarkers, ...]:
@@ -100,7 +100,7 @@ def seen_markers(image: NDArray[np.generic]) -> tuple[SeenMarkers, ...]:
     return ()
 
 
-def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundPlane:
+def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundBoard:
     """The board whose markers images show, at least one for each.
 
     Raises NoBoardError if they do not tell it; the message says what is not known.
@@ -120,7 +120,7 @@ def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundPlane:
     )
 
 
-def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> FoundPlane:
+def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> FoundBoard:
     dictionary, border, tags, inverted = key
     parts = joined(numbering.parts)
     above, begins = _beyond(parts, seen, last=False)
@@ -144,7 +144,7 @@ def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> Foun
     plane = with_proportions(plane, [(seen[part.source].image, part.lie.marks) for part in parts])
     if inverted and plane.markers is not None:
         plane = replace(plane, markers=replace(plane.markers, inverted=True))
-    return FoundPlane(plane, begins and stops, _doubts(possible))
+    return FoundBoard(plane, begins and stops, _doubts(possible))
 
 
 def _shown(part: Numbered) -> float:
