@@ -83,25 +83,15 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
         camera = replace(state.of_view(int(which[0])), R=state.R[which], t=state.t[which])
         own = label[np.isin(views.index, which)]
         sight = Sight(views.subset(which), camera, np.ones(f, dtype=bool), True, own)
-        left = WithoutPoses(information_of([sight], n)).matrix
+        left = WithoutPoses(information_of([sight], n).turned(prior.axes)).matrix
         information += left[f:-1, f:-1]
         coupling[s] = jacobian[which[0]].T @ left[:f, f:-1]
     if not data.free_theta:
         coupling[:, -1] = 0.0
-    turn = _block_diagonal(prior.axes)
-    spread = turn @ prior_covariance(prior, target.sizes) @ turn.T
-    root = np.linalg.cholesky(spread)
+    root = np.linalg.cholesky(prior_covariance(prior, target.sizes))
     inner = np.eye(3 * n) + root.T @ (information / variance) @ root
     root = root @ np.linalg.inv(np.linalg.cholesky(inner)).T
     flat = coupling.reshape(-1, 3 * n) @ root
     U, values, _ = np.linalg.svd(flat, full_matrices=False)
     kept = (values > _NOTHING * values[0])[:_MOST]
     return np.asarray((U * values)[:, : int(kept.sum())].reshape(*coupling.shape[:2], -1))
-
-
-def _block_diagonal(blocks: Array) -> Array:
-    """(3 n, 3 n) from (n, 3, 3)."""
-    n = len(blocks)
-    whole = np.zeros((n, 3, n, 3))
-    whole[np.arange(n), :, np.arange(n)] = blocks
-    return whole.reshape(3 * n, 3 * n)
