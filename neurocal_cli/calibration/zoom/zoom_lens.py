@@ -238,8 +238,7 @@ class ZoomLens(Summarised):
         between = np.einsum("mni,mnj->nij", deviation, deviation) / max(len(both) - 1, 1)
         covariance = within + between
         L = len(self.names)
-        if not self.known:
-            covariance[:, range(L), range(L)] += self.scatter
+        covariance[:, range(L), range(L)] += self.scatter
         return Prediction(locals_.mean(axis=0), constants, covariance)
 
 
