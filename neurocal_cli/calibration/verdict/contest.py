@@ -17,6 +17,7 @@ from neurocal_cli.adjustment.board.prior import STRETCH
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.verdict.effects import common, field
 from neurocal_cli.calibration.verdict.findings import (
     DISPLACED,
     ERROR,
@@ -27,9 +28,9 @@ from neurocal_cli.calibration.verdict.findings import (
     image_diagonal,
     or_else,
 )
-from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
+from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
-from neurocal_cli.calibration.verdict.rivals import EFFECTS, RICHER_LENSES, RIVALS, SHAPES
+from neurocal_cli.calibration.verdict.rivals import EFFECTS, NEIGHBOURS, RICHER_LENSES, RIVALS, SHAPES
 from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -53,6 +54,7 @@ class Contest:
     close: tuple[tuple[Estimate, ...], ...]  # rivals that are hardly less probable, of each cause
     explained: float  # share of the squared error that all of them explain
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
+    n: float  # effective number of equations beyond the unknowns
     of_outliers: bool = False  # whether the first one explains the outliers, which are included
     remains: bool = True  # whether the points that are no outliers show it as well
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
@@ -99,11 +101,19 @@ def contest(
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
-    lin = linearised(views, state, free, free_poses, EFFECTS, image_size, named_lens)
-    if shaped:
-        lin = _with_shape(lin)
+
+    def at_minimum(*more: Effect) -> Linearised:
+        lin = linearised(views, state, free, free_poses, (*EFFECTS, *more), image_size, named_lens)
+        return _with_shape(lin) if shaped else lin
+
     try:
-        return _held(lin, worth)
+        held = _held(at_minimum(), worth, RIVALS)
+        if all(one.pattern == "all" for one in held.causes):
+            return held
+        smooth, *_ = estimates(at_minimum(field), held.n, (NEIGHBOURS,))
+        if sum(one.evidence for one in held.causes) > smooth.evidence + LEVEL:
+            return held
+        return _held(held.lin, worth, tuple(rival for rival in RIVALS if rival.patterns is common))
     except np.linalg.LinAlgError:
         return None
 
@@ -119,9 +129,9 @@ def _with_shape(lin: Linearised) -> Linearised:
     return replace(lin, R=R, free=np.concatenate([lin.free, new]), spare=max(lin.spare - len(new), 1.0))
 
 
-def _held(lin: Linearised, worth: float) -> Contest:
+def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
     n = lin.spare * worth
-    ranking = estimates(lin, n, RIVALS, LEVEL)
+    ranking = estimates(lin, n, rivals, LEVEL)
     fits: dict[_Key, _Fit | None] = {}
     if ranking and ranking[0].evidence > LEVEL:
         # Alike even with the best rival, not because of it.
@@ -130,11 +140,11 @@ def _held(lin: Linearised, worth: float) -> Contest:
         nearest = min(found, key=lambda fit: fit.cost, default=_Fit(np.inf))
         if nearest.errors is not None and nearest.cost < float((errors**2).sum()):
             errors = nearest.errors
-        alike, of_two = correlation(lin.views, errors), _errors_of_two(lin, ranking[0], n)
+        alike, of_two = correlation(lin.views, errors), _errors_of_two(lin, ranking[0], n, rivals)
         if of_two is not None:
             alike = min(alike, correlation(lin.views, of_two))
         n = effective_number(n, alike)
-        ranking = [_refined(lin, one, fits) for one in estimates(lin, n, RIVALS)]
+        ranking = [_refined(lin, one, fits) for one in estimates(lin, n, rivals)]
         ranking.sort(key=lambda one: -one.evidence)
     share = n / lin.spare
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
@@ -142,7 +152,7 @@ def _held(lin: Linearised, worth: float) -> Contest:
     close: list[tuple[Estimate, ...]] = []
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST_CAUSES:
         ranking = _likeliest_first(ranking)
-        chosen = _best(at, ranking, share)
+        chosen = _best(at, ranking, share, rivals)
         far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
         least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
         for one in chosen:
@@ -151,16 +161,16 @@ def _held(lin: Linearised, worth: float) -> Contest:
             close.append(tuple(x for x in ranking[1:] if alone and x.evidence > one.evidence - LEVEL))
             evidence, left = evidence + one.evidence, left * (1.0 - one.explained)
             at = including(at, one)
-        ranking = estimates(at, at.spare * share, _others(causes))
+        ranking = estimates(at, at.spare * share, _others(causes, rivals))
     # As an estimated target counts it: all residuals as independent.
     evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
-    return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence)
+    return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence, n)
 
 
-def _errors_of_two(lin: Linearised, first: Estimate, n: float) -> Array | None:
+def _errors_of_two(lin: Linearised, first: Estimate, n: float, rivals: tuple[Rival, ...]) -> Array | None:
     """(N, 2) residuals with a second cause beside the first; at least one of them is shared by views."""
     at = including(lin, first)
-    seconds = estimates(at, n, _others([first]), LEVEL)
+    seconds = estimates(at, n, _others([first], rivals), LEVEL)
     second = next((one for one in seconds if first.weights.size or one.weights.size), None)
     if second is None or second.evidence < LEVEL:
         return None
@@ -179,12 +189,14 @@ def _likeliest_first(ranking: list[Estimate]) -> list[Estimate]:
     return sorted(ranking[:n], key=lambda one: (not one.rival.of_given, one.rival.unknown)) + ranking[n:]
 
 
-def _others(causes: Iterable[Estimate]) -> tuple[Rival, ...]:
+def _others(causes: Iterable[Estimate], rivals: tuple[Rival, ...]) -> tuple[Rival, ...]:
     known = {one.rival.cause for one in causes}
-    return tuple(one for one in RIVALS if one.cause not in known)
+    return tuple(one for one in rivals if one.cause not in known)
 
 
-def _best(at: Linearised, ranking: list[Estimate], share: float) -> tuple[Estimate, ...]:
+def _best(
+    at: Linearised, ranking: list[Estimate], share: float, rivals: tuple[Rival, ...]
+) -> tuple[Estimate, ...]:
     """The best rival, or the best two that are more probable together."""
     best: tuple[Estimate, ...] = (ranking[0],)
     highest = ranking[0].evidence + LEVEL
@@ -193,7 +205,7 @@ def _best(at: Linearised, ranking: list[Estimate], share: float) -> tuple[Estima
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
     for one in [one for one in others if one.weights.size][:_TRIED]:
         both = including(at, one)
-        second = estimates(both, both.spare * share, _others([one]), highest - one.evidence)
+        second = estimates(both, both.spare * share, _others([one], rivals), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
         second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
         if second and one.evidence + second[0].evidence > highest:

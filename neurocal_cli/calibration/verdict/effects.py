@@ -41,6 +41,13 @@ def stretch(seen: Seen) -> Array | None:
     return seen.by_board[:, :1] * np.stack(list(seen.places), axis=1)[:, :, None]
 
 
+def field(seen: Seen) -> Array:
+    """A smooth field of displacements, by powers of the place on the board; of that in the image if none."""
+    x, y = np.moveaxis(seen.pixels, 1, 0) if seen.places is None else seen.places
+    powers = np.stack([x**i * y**j for i, j in ((1, 0), (0, 1), *BENDS)], axis=1)[:, :, None]
+    return np.concatenate([seen.by_entries[:, 3 + a, None] * powers for a in (0, 1)], axis=1)
+
+
 def glass(seen: Seen) -> Array | None:
     """A plate of glass on the board: points move away from the foot of the camera's perpendicular."""
     if seen.by_board is None or seen.to_camera is None:

@@ -219,6 +219,16 @@ RIVALS: tuple[Rival, ...] = (
     ),
 )
 """All rivals; those with the same name are alternatives of one cause."""
+NEIGHBOURS = Rival(
+    "noise that neighbours share",
+    "smooth residuals of any kind, in each view others",
+    "",
+    words.plain("the residuals are smooth, in each view others, by {px} px rms"),
+    DISPLACED,
+    effect=effects.field,
+    unknown=True,
+)
+"""Causes that differ between views are not told if this is as probable as all causes together."""
 SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is effects.common)
 """Those by which the target has another shape in all views."""
 EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
