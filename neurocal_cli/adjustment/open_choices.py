@@ -19,14 +19,15 @@ Noise can hide the stretch of a print, and a stretched print biases the focal le
 was kept, two unknowns o are open: a stretch (one side longer than stated) and a lean (sides that are not
 perpendicular). Each is either absent or has a Gaussian prior with the size typical of prints; a lean may also
 be small, as that of most prints. The covariance is that of model averaging over all six models, around the
-reported parameters for the given target.
+reported parameters for the given target. A folded target is stretched as a whole, in any direction: five
+unknowns, which are absent or present together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -267,26 +268,26 @@ def open_stretch(found: Covariance, m: Minimum, world: Array, variance: float) -
 
     The first columns are those of the free parameters of the camera, which is at its minimum for the given
     target. The variance is that of the residuals, enlarged if they are correlated. The covariance stays as it
-    is, and the probability is 0, if the stretch is negligible or the target is not flat.
+    is, and the probability is 0, if the stretch is negligible.
     """
-    if not is_flat(world):
-        return found, 0.0
-    normal = stretched_blocks(m.views.batches, m.state, stretches(world))
-    arrow = replace(m, normal=normal, free=np.append(m.free, [True, True])).arrow
+    by = stretches(world)
+    normal = stretched_blocks(m.views.batches, m.state, by)
+    arrow = replace(m, normal=normal, free=np.append(m.free, np.ones(len(by), dtype=bool))).arrow
     return with_stretch(found, np.arange(int(m.free.sum())), arrow, variance)
 
 
 def with_stretch(
     found: Covariance, place: Columns, arrow: Arrowhead, variance: float
 ) -> tuple[Covariance, float]:
-    """The same for any cameras, from the normal equations of the estimated parameters and the two stretches.
+    """The same for any cameras, from the normal equations of the estimated parameters and the stretches.
 
     `place` are the columns of these parameters in the covariance.
     """
-    spread = spread_of_stretch(arrow, variance)
+    n = len(arrow.shared) - 1
+    spread = spread_of_stretch(arrow, variance, n - len(place))
     if spread is None:
         return found, 0.0
-    is_stretch = np.arange(len(place) + 2) >= len(place)
+    is_stretch = np.arange(n) >= len(place)
     return opened(found, place, arrow, spread, is_stretch)[0], spread.probability
 
 
@@ -295,8 +296,13 @@ def stretches(world: Array) -> Array:
 
     The sides' direction follows from the points: with z = x + i y around the centre, 5 mean(z^2)^2 -
     mean(z^4) is positive for rectangles with sides along x and y, and rotates by four times the angle of the
-    sides.
+    sides. Of a target that is not flat, (5, 3, 3) deformations without a change of scale, which are the same
+    along any axes.
     """
+    if not is_flat(world):
+        X, Y, Z = np.eye(3)[:, :, None] * np.eye(3)[:, None]
+        shears = [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
+        return np.stack([X - Y, (X + Y - 2 * Z) / np.sqrt(3), *shears])
     centred = world - world.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
     z2 = (centred @ (axes[0] + 1j * axes[1]) / np.abs(centred).max()) ** 2  # of any unit, without overflow
@@ -306,22 +312,24 @@ def stretches(world: Array) -> Array:
     return np.stack([np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)])
 
 
-def spread_of_stretch(arrow: Arrowhead, variance: float) -> SpreadOfOpen | None:
-    """Posterior of the two stretches; None if they are negligible, or larger than those of prints.
+def spread_of_stretch(arrow: Arrowhead, variance: float, m: int = 2) -> SpreadOfOpen | None:
+    """Posterior of the m stretches; None if they are negligible, or larger than those of prints.
 
-    The normal equations are those of the free parameters and, the last ones, the stretches. The variance is
-    that of the residuals.
+    The normal equations are those of the free parameters and, the last ones, the stretches: two of a plane,
+    five of a target that is not flat. The variance is that of the residuals.
     """
     reduced, _ = arrow.reduced(RIDGE)
     S, g = reduced[:-1, :-1], reduced[:-1, -1]
-    is_open = np.arange(len(g)) >= len(g) - 2
-    groups = (np.array([0]), np.array([1]))
-    prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, STRETCH), groups, _ODDS_OF_PRINTS, (1.0,))
+    is_open = np.arange(len(g)) >= len(g) - m
+    groups, odds = (np.array([0]), np.array([1])), _ODDS_OF_PRINTS
+    if m > 2:
+        groups, odds = (np.arange(m),), _ODDS_OF_PRINTS[:1]
+    prior = OpenPrior(is_open, is_open, np.zeros(m), np.full(m, STRETCH), groups, odds, (1.0,))
     found = spread_of_open(arrow, variance, prior)
     if found is None:
         return None
-    T = found.follow[:-2]
-    left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance
-    right = (g[-2:] + T.T @ g[:-2]) / variance
+    T = found.follow[:-m]
+    left = (S[-m:, -m:] + S[-m:, :-m] @ T) / variance
+    right = (g[-m:] + T.T @ g[:-m]) / variance
     beyond = float(right @ solve_or_nan(left + STRETCH**2 * left @ left, right))
     return found if found.probability > _NEGLIGIBLE and not beyond > _NO_PRINT**2 else None

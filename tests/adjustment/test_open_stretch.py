@@ -49,8 +49,8 @@ def test_a_stretch_that_noise_hides_is_in_the_standard_deviations() -> None:
 def only(which: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """One of the stretches is there, with a std of 1; how all that is free follows is as it was found."""
 
-    def known(arrow: Arrowhead, variance: float) -> SpreadOfOpen:
-        found = spread_of_stretch(arrow, 1e12)
+    def known(arrow: Arrowhead, variance: float, m: int) -> SpreadOfOpen:
+        found = spread_of_stretch(arrow, 1e12, m)
         assert found is not None
         return SpreadOfOpen(np.diag(np.eye(2)[which]), found.follow, 1.0)
 

@@ -44,7 +44,6 @@ from neurocal_cli.adjustment.open_choices import (
 from neurocal_cli.adjustment.reprojection import camera_columns, stretched_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
 _LEAST_FRAMES = 3  # fewest for a jackknife; with two, the covariance is multiplied by the scatter
@@ -199,19 +198,22 @@ def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: lis
 def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:
     """Add the stretch of the print to a covariance of all shared unknowns; and the probability of a stretch.
 
-    The probability is 0 if the stretch is negligible or the target is not flat. Cameras that were not refined
+    The probability is 0 if the stretch is negligible. Cameras that were not refined
     respond to the stretch as well, because they were calibrated on this target.
     """
     world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
-    if not is_flat(world) or not fit.variance > 0:
+    if not fit.variance > 0:
         return found, 0.0
     estimated, n = np.flatnonzero(fit.problem.estimated_shared), fit.state.columns.n_shared
+    by = stretches(world)
     blocks = [
-        stretched_blocks(observed.views.batches, fit.problem.camera(fit.state, side), stretches(world))
+        stretched_blocks(observed.views.batches, fit.problem.camera(fit.state, side), by)
         for side, observed in enumerate(fit.problem.observations)
     ]
     arrow = fit.problem.gathered(fit.problem.view_equations(fit.state, blocks))
-    return with_stretch(found, estimated, arrow.only(np.append(estimated, [n, n + 1])), fit.variance)
+    return with_stretch(
+        found, estimated, arrow.only(np.append(estimated, n + np.arange(len(by)))), fit.variance
+    )
 
 
 def covariance_by_given(fit: RigFit) -> Array:

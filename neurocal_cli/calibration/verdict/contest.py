@@ -110,10 +110,12 @@ def contest(
         held = _held(at_minimum(), worth, RIVALS)
         if all(one.pattern == "all" for one in held.causes):
             return held
-        smooth, *_ = estimates(at_minimum(field), held.n, (NEIGHBOURS,))
+        lin = at_minimum(field)
+        smooth, *_ = estimates(lin, held.n, (NEIGHBOURS,))
         if sum(one.evidence for one in held.causes) > smooth.evidence + LEVEL:
             return held
-        return _held(held.lin, worth, tuple(rival for rival in RIVALS if rival.patterns is common))
+        of_all = tuple(rival for rival in RIVALS if rival.patterns is common)
+        return _held(including(lin, smooth), worth, of_all)
     except np.linalg.LinAlgError:
         return None
 
