@@ -321,9 +321,8 @@ def spread_of_stretch(arrow: Arrowhead, variance: float, m: int = 2) -> SpreadOf
     reduced, _ = arrow.reduced(RIDGE)
     S, g = reduced[:-1, :-1], reduced[:-1, -1]
     is_open = np.arange(len(g)) >= len(g) - m
-    groups, odds = (np.array([0]), np.array([1])), _ODDS_OF_PRINTS
-    if m > 2:
-        groups, odds = (np.arange(m),), _ODDS_OF_PRINTS[:1]
+    groups = (np.array([0]), np.array([1])) if m == 2 else (np.arange(m),)
+    odds = _ODDS_OF_PRINTS[: len(groups)]
     prior = OpenPrior(is_open, is_open, np.zeros(m), np.full(m, STRETCH), groups, odds, (1.0,))
     found = spread_of_open(arrow, variance, prior)
     if found is None:
