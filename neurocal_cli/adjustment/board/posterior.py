@@ -97,15 +97,15 @@ OUT_OF_PLANE = ("curl", "twist", "bend", "height")
 """Parts that move points out of their plane."""
 _SWITCHED = ("stretch", "lean")
 _START = {
-    "fold": 3e-3,
-    "curl": 3e-3,
-    "twist": 3e-3,
-    "bend": 3e-3,
+    "fold": 6e-4,
+    "curl": 6e-4,
+    "twist": 6e-4,
+    "bend": 6e-4,
     "stretch": STRETCH,
     "lean": STRETCH,
-    "warp": 5e-4,
-    "place": 3e-4,
-    "height": 3e-4,
+    "warp": 1e-4,
+    "place": 6e-5,
+    "height": 6e-5,
 }  # of the target's size
 # Least gain in log evidence with which a stretch or a lean is estimated, as by the odds in `open_stretch`.
 # With 0, errors from five views of bent boards are 5 to 10 % larger (test_simulated_targets.py, slow).
@@ -200,8 +200,6 @@ def posterior(
     noise = math.sqrt(info.cost / info.spare if variance is None else variance)
     if sizes is not None:
         start = prior.as_array(sizes) / noise
-    elif isinstance(system, PosesFirst):
-        start = climb.allowed(system.moments(info.spare), noise)
     else:
         start = np.array([_START[name] for name in prior.names]) * prior.size / noise
     now = climb.climbed(climb.at(np.minimum(start, climb.most / noise)))
@@ -306,12 +304,6 @@ class _Climb:
         self.switched = [self.names.index(name) for name in _SWITCHED if name in self.names]
         self.of_prints = STRETCH * prior.size
         self.most_of_prints = [_MOST.get(name, 0.0) * prior.size for name in self.names]
-
-    def allowed(self, ratios: Array, noise: float) -> Array:
-        """Ratios in the range of each part; stretch and lean have the least size of prints."""
-        ratios = np.maximum(ratios, self.least / noise)
-        ratios[self.switched] = self.of_prints / noise
-        return ratios
 
     def at(self, ratios: Array) -> _Solution:
         """The solution for these sizes of the parts."""

@@ -83,11 +83,6 @@ def sum_of(matrices: Sequence[Array]) -> Array:
 
 
 _SMALL = 32  # largest matrix whose Cholesky factor is inverted directly; others are split in halves
-_ROUNDING = 1e-12  # of the largest diagonal element
-_LEAST_NOISE = 0.01  # of the variance with the given points
-# The start of a variance that is estimated as negative, which an absent part is as often as not, over the
-# size of the estimate. Shares of 0.01 to 0.1 need equally many steps.
-_UNSURE = 0.03
 _RIDGE = 1e-10  # added to a unit diagonal if rounding has made a matrix indefinite
 # Offsets over poses and smooth coefficients, up to which eliminating the poses is faster. On boards of 54 to
 # 300 points in 8 to 60 views, both take the same time at 1.7; at 0.75 and 3.9 one takes three times as long.
@@ -220,29 +215,6 @@ class PosesFirst:
                 yield part.poses, inverse @ np.swapaxes(inverse, 1, 2), by_root
 
         return JointCovariance(camera, offsets, np.zeros((n, 3, 3)), poses)
-
-    def moments(self, spare: float) -> Array:
-        """(G,) rough sizes of the parts over the noise's standard deviation, by the method of moments.
-
-        At the given points, the gradient g by the coordinates has the covariance ``sigma^2 N + N T N``, with
-        the matrix N, from which cameras and poses are eliminated, and the prior covariance T. So the expected
-        squares of g, summed over the coordinates of each part, and the expected squared error are linear in
-        sigma^2 and the squared sizes (Rao 1971: minimum norm quadratic unbiased estimation).
-        """
-        f, units = self.f, self.coordinates.units
-        response = np.linalg.solve(
-            self.matrix[:f, :f], np.column_stack([self.matrix[:f, f:], self.right[:f]])
-        )
-        N = self.matrix[f:, f:] - self.matrix[f:, :f] @ response[:, :-1]
-        g = self.right[f:] - self.matrix[f:, :f] @ response[:, -1]
-        own = np.diagonal(N)
-        own = np.maximum(own, _ROUNDING * own.max())
-        weighted = units / own[:, None]
-        cost = self.given_cost - self.right[:f] @ response[:, -1]
-        left = np.block([[spare, own @ units], [(own @ weighted)[:, None], weighted.T @ (N * N) @ units]])
-        squares = np.linalg.lstsq(left, np.append(cost, g**2 @ weighted), rcond=None)[0]
-        noise = max(squares[0], _LEAST_NOISE * cost / spare)
-        return np.asarray(np.sqrt(np.maximum(squares[1:], -_UNSURE * squares[1:]) / noise))
 
 
 class PointsFirst:
