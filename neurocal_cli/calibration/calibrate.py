@@ -71,7 +71,7 @@ _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
 _NOT_FOUND = (
     "the target stays as given: either another shape does not predict the points of other views better, or "
     "these points do not determine it, which needs three different views of most points and offsets below "
-    "5 % of the target's size"
+    "10 % of the target's size"
 )
 
 

@@ -167,13 +167,6 @@ class Target:
         scales = (np.linalg.svd(linear, compute_uv=False) for linear in self._linear())
         return max(float(along / across - 1) for along, across in scales)
 
-    def sides(self) -> tuple[float, float]:
-        """Elongation of a side over the other one, and angle [rad] off a right angle, of the worst planes."""
-        linear = np.array(list(self._linear()))
-        one, two = np.linalg.norm(linear, axis=2).T
-        cosine = (linear[:, 0] * linear[:, 1]).sum(axis=1) / (one * two)
-        return float(np.maximum(one / two, two / one).max() - 1), float(np.abs(np.arcsin(cosine)).max())
-
     def unequal(self) -> float:
         """Largest relative deviation of a plane's found over given size from the mean of the planes."""
         scales = np.sqrt(np.abs(np.linalg.det(np.array(list(self._linear())))))

@@ -62,8 +62,7 @@ _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _NOT_YET = 5.0  # log evidence that another step may add; without it, 56 sets of all shapes end the same
 _SETTLED = 0.02  # of the cameras' standard deviations
-_LARGEST = 0.05  # largest offset over the target's size; more is another target
-_LEANING = 0.03  # rad; largest lean, of which upright boards leave much open: 0.02 on one in photographs
+_LARGEST = 0.1  # largest offset over the target's size; more is another target
 _FEWEST, _FEWEST_OF_FOLDED = 3, 1  # fewest different views of most points
 LEAST_GAIN = 6.0
 """Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
@@ -326,8 +325,6 @@ class Search:
             self.given, self._common(), std, self.plane, found.sizes, self.flat, found.evidence - given,
             self.ids, bends=bends,
         )  # fmt: skip
-        if not target.sides()[1] < _LEANING:
-            return None
         return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
 
     def _without(self, info: Information) -> float:

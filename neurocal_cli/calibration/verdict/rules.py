@@ -57,6 +57,7 @@ _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
 # 0.0018. A board that leans by 0.006 and stands upright in all views may turn theta by as much;
 # test_a_leaning_board_is_not_good has one that leans by 0.01.
 _SKEWED = 0.004
+_LEANING = Limit(MISPRINT, 0.025)  # rad, of a target's sides
 _UNCHECKED = (
     "the camera needs every view, so it may take in errors of single views, such as a board that bends, and "
     "its std do not include them",
@@ -320,7 +321,7 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
     """Findings about an estimated target that differs from its description as no print does."""
     measure = "measure the target along both sides, and give its true size"
     if target.plane.any() or not is_flat(target.given):
-        off = max(target.sides()[0], target.unequal())
+        off = max(target.stretch(), target.unequal())
         yield (
             STRETCHED_PRINT.grade(off),
             f"the sides of the target's planes are {100 * off:.2g} % off its description: {WRONG_PRINT}",
@@ -334,9 +335,9 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
     sides = stretches(given)
     stretch, lean = (sides * linear).sum(axis=(1, 2)).tolist()
     longer, other = ("XYZ"[k(stretch * np.diag(sides[0]))] for k in (np.argmax, np.argmin))
-    if "theta" not in calibration.fixed and abs(lean) > MISPRINT:
+    if "theta" not in calibration.fixed:
         yield (
-            1,
+            _LEANING.grade(abs(lean)),
             f"the sides of the target are off a right angle by {np.degrees(abs(lean)):.2f} degrees, more "
             "than those of prints, so theta may be wrong by more than its std",
             "measure the target, turn it by 90 degrees in some views, or give --no-skew",

@@ -304,13 +304,26 @@ def test_a_print_that_is_described_wrongly_by_percents_is_measured(by: float) ->
     points = photographed(poses(14, rng), rng)
     found = calibrate(replace(points, world=points.world / [1 + by, 1, 1]))
     assert found.target is not None
-    assert found.target.sides()[0] == pytest.approx(abs(by), rel=0.06)
+    assert found.target.stretch() == pytest.approx(abs(by), rel=0.06)
     assert f" % longer along {'XY'[by < 0]}, compared with" in reasons(found)
     assert 0.5 * abs(by) == pytest.approx(found.target.std_of_scale(), rel=0.1)
     for one in found.views.values():  # the scale of the poses is unknown
         assert one.std["t_z"] > 0.4 * abs(by) * one.pose.t[2]
     for name in ("alpha_u", "alpha_v", "u0", "v0"):
         assert abs(getattr(found.intrinsics, name) - getattr(CAMERA.intrinsics, name)) < 4 * found.std[name]
+
+
+def test_boards_far_from_their_description_give_the_true_camera() -> None:
+    """Bent by 10 of 200 mm, and with sides that lean by 3.4 degrees."""
+    rng = np.random.default_rng(3)
+    bent, plain = (photographed(poses(14, rng), rng, curl=by) for by in (10.0, 0.0))
+    leaning = replace(plain, world=plain.world + 0.06 * plain.world[:, [1, 2, 2]])
+    for points, word, told in ((bent, "good", ""), (leaning, "poor", "off a right angle by 3.4")):
+        found = calibrate(points)
+        assert abs(found.intrinsics.alpha_u - CAMERA.intrinsics.alpha_u) < 4 * found.std["alpha_u"] < 3
+        assert told in reasons(found)
+        assert found.verdict is not None
+        assert found.verdict.word == word
 
 
 @pytest.mark.parametrize("by", [0.3, 0.6])
