@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.prior import STRETCH
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.effects import common, field
@@ -134,20 +134,17 @@ def _with_shape(lin: Linearised) -> Linearised:
 def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
     n = lin.spare * worth
     ranking = estimates(lin, n, rivals, LEVEL)
-    fits: dict[_Key, _Fit | None] = {}
+    fitted: set[str] = set()
     if ranking and ranking[0].evidence > LEVEL:
         # Alike even with the best rival, not because of it.
-        errors = lin.residuals(_steps(lin, ranking[0]))
-        found = [fit for one in ranking if (fit := _fitted(lin, one, fits)) is not None]
-        nearest = min(found, key=lambda fit: fit.cost, default=_Fit(np.inf))
-        if nearest.errors is not None and nearest.cost < float((errors**2).sum()):
-            errors = nearest.errors
-        alike, of_two = correlation(lin.views, errors), _errors_of_two(lin, ranking[0], n, rivals)
+        alike = correlation(lin.views, lin.residuals(_steps(lin, ranking[0])))
+        of_two = _errors_of_two(lin, ranking[0], n, rivals)
         if of_two is not None:
             alike = min(alike, correlation(lin.views, of_two))
         n = effective_number(n, alike)
-        ranking = [_refined(lin, one, fits) for one in estimates(lin, n, rivals)]
-        ranking.sort(key=lambda one: -one.evidence)
+        fits = [(one, _fit(lin, one)) for one in estimates(lin, n, rivals)]
+        fitted = {one.rival.cause for one, fit in fits if fit is not None}
+        ranking = sorted((_refined(lin, *one) for one in fits), key=lambda one: -one.evidence)
     share = n / lin.spare
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
     causes: list[Estimate] = []
@@ -155,7 +152,7 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST_CAUSES:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, share, rivals)
-        far = not chosen[0].weights.size or fits.get(_key(chosen[0])) is not None
+        far = not chosen[0].weights.size or chosen[0].rival.cause in fitted
         least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
         for one in chosen:
             causes.append(one)
@@ -221,20 +218,11 @@ class _Fit:
 
     cost: float
     entries: Array | None = None  # of A, if the views share one camera
-    errors: Array | None = None  # (N, 2) residuals, if so
 
 
-_Key = tuple[str, int, bytes]
-
-
-def _key(one: Estimate) -> _Key:
-    """What makes two estimates the same fit: the cause, its unknowns, and the views that have it."""
-    return one.rival.cause, len(one.amounts), one.weights.tobytes()
-
-
-def _refined(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> Estimate:
+def _refined(lin: Linearised, one: Estimate, fit: _Fit | None) -> Estimate:
     """The estimate with the cost of its fit, if there is one and it is lower."""
-    fit, left = _fitted(lin, one, fits), (1.0 - one.explained) * lin.cost
+    left = (1.0 - one.explained) * lin.cost
     if fit is None or not 0 < fit.cost < left:
         return one
     n, camera, amounts = left / one.noise, one.camera, one.amounts
@@ -251,15 +239,8 @@ def _refined(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> E
     )  # fmt: skip
 
 
-def _fitted(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> _Fit | None:
-    """Fit two cameras that are far apart, and lenses and given values that explain much; None for others."""
-    key = _key(one)
-    if key not in fits:
-        fits[key] = _fit(lin, one)
-    return fits[key]
-
-
 def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
+    """Fit two cameras that are far apart, and lenses and given values that explain much; None for others."""
     views, state, K = lin.views, lin.state, len(lin.state.k)
     if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > NEAR:
         free, member = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5
@@ -273,7 +254,7 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
         added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
         fit = adjust(views.batches, state, free, True, NEARBY)
-        return _Fit(float(fit.cost.sum()), fit.state.entries[0], point_residuals(views, fit.state))
+        return _Fit(float(fit.cost.sum()), fit.state.entries[0])
     return None
 
 

@@ -6,6 +6,8 @@ views share it (`patterns`), and its words. Ten lines are usual.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from neurocal_cli.calibration.verdict import effects, words
 from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, SHARE, Limit
 from neurocal_cli.calibration.verdict.rival import Rival
@@ -219,15 +221,7 @@ RIVALS: tuple[Rival, ...] = (
     ),
 )
 """All rivals; those with the same name are alternatives of one cause."""
-NEIGHBOURS = Rival(
-    "noise that neighbours share",
-    "smooth residuals of any kind, in each view others",
-    "",
-    words.plain("the residuals are smooth, in each view others, by {px} px rms"),
-    DISPLACED,
-    effect=effects.field,
-    unknown=True,
-)
+NEIGHBOURS = replace(RIVALS[-1], cause="noise that neighbours share", steps=None, effect=effects.field)
 """Causes that differ between views are not told if this is as probable as all causes together."""
 SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is effects.common)
 """Those by which the target has another shape in all views."""
