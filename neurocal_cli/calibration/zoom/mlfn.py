@@ -64,7 +64,7 @@ class Topology:
     controls: int  # inputs, D
     own: int  # tanh units of the first hidden layer for each control, beside its rational unit
     hidden: int  # units of the second hidden layer, H
-    rich: bool = True  # whether tanh units have products; they had none in files of earlier versions
+    rich: bool = True  # whether tanh units have products, too
 
     @property
     def width(self) -> int:

@@ -67,7 +67,7 @@ SCALES = ("log", "linear", "inverse")
 TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
 # Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
-_WEIGHTS_PER_SETTING = 2.0
+_WEIGHTS_PER_SETTING, _WITH_PRODUCTS = 2.0, 1.5  # most of them, and most if tanh units have products
 _LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
 _AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
 _GRID = 13  # values of each control at which networks are compared
@@ -305,7 +305,7 @@ def _fit(
     scaled = (targets - centre) / spread
     nets, evidence = [], []
     for own, hidden in budget.topologies or _suitable_topologies(x):
-        topology = Topology(x.shape[1], own, hidden)
+        topology = suitable_topology(x, own, hidden)
         start = topology.random_weights(budget.starts if own + hidden else 1, rng)
         trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)
         for w, a, tau2, e in zip(
@@ -321,7 +321,13 @@ def _suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
     """Topologies for settings (S, D): at most two weights a setting, as the priors make most of them idle."""
     limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
     choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
-    return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
+    return tuple(pair for pair in choices if suitable_topology(x, *pair).n_weights <= limit)
+
+
+def suitable_topology(x: Array, own: int, hidden: int) -> Topology:
+    """The topology for settings (S, D); where these are few, its tanh units have no products."""
+    topology = Topology(x.shape[1], own, hidden)
+    return replace(topology, rich=topology.n_weights <= _WITH_PRODUCTS * len(x))
 
 
 def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:

@@ -20,6 +20,7 @@ from neurocal_cli.calibration.zoom.joint_training import JointLearner, take_turn
 from neurocal_cli.calibration.zoom.mlfn import Schedule, Topology, respond, respond_with_jacobian, train
 from neurocal_cli.calibration.zoom.parameter_networks import (
     SCALES,
+    TOPOLOGIES,
     Budget,
     LensNets,
     ParameterNet,
@@ -27,6 +28,7 @@ from neurocal_cli.calibration.zoom.parameter_networks import (
     from_scale,
     local_to_outputs,
     outputs_to_local,
+    suitable_topology,
     to_scale,
 )
 from neurocal_cli.calibration.zoom.settings import (
@@ -115,6 +117,12 @@ def test_products_are_of_different_controls(rich: bool, among: set[tuple[int, in
     y = sum(w * units[:, i] * units[:, j] for w, i, j in zip(m, *topology.pairs, strict=True))
     np.testing.assert_allclose(respond(topology, network(topology, m=m, s=s, c=c), x)[0], y, rtol=1e-13)
     assert Topology(1, 2, 2).pairs[0].size == 0
+
+
+def test_tanh_units_have_products_where_there_are_enough_settings() -> None:
+    few, many = np.zeros((16, 2)), np.zeros((45, 2))
+    assert all(suitable_topology(many, own, hidden).rich for own, hidden in TOPOLOGIES)
+    assert [suitable_topology(few, own, 0).rich for own in (1, 2, 3)] == [True, False, False]
 
 
 @given(st.sampled_from(SCALES), st.floats(1, 1e5))
