@@ -35,7 +35,7 @@ from neurocal_cli.adjustment.board.information import (
 )
 from neurocal_cli.adjustment.board.posterior import camera_step, camera_step_of, log_evidence, minimum_of
 from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
-from neurocal_cli.adjustment.board.system import WithoutPoses, points_first, sum_of
+from neurocal_cli.adjustment.board.system import WithoutPoses, points_first
 from neurocal_cli.adjustment.cross_validation import least_by_precision
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.camera.geometry import Array
@@ -211,7 +211,7 @@ def without_each(
             estimated.append(minimum_of(replace(some, cameras=cameras), prior, sizes, variance))
         return estimated
     matrices = [part.matrix for part in parts]
-    whole = sum_of(matrices)
+    whole = np.asarray(sum(matrices))
     whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
     estimated = []
     for out in matrices:

@@ -1,5 +1,6 @@
 """Views pair by name, points by id or place; nothing pairs by its order."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from support.rigs import random_rig
 
 from neurocal_cli import Correspondences
-from neurocal_cli.calibration.rig.frames import ViewPairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.frames import ViewPairs, check_one_target, pair_points, pair_views
 from neurocal_cli.errors import InputError
 
 
@@ -112,8 +113,11 @@ def test_different_units_are_refused() -> None:
 
 def test_ids_that_name_different_places_are_refused() -> None:
     left, right = (with_ids(points) for points in two_cameras())
-    message = refusal(left, replace(right, world=right.world / 10))
-    assert "'200:0' is at (20, 0, 0), but at (200, 0, 0) in left.csv" in message
+    moved = replace(right, world=right.world / 10)
+    farthest = "'200:0' is at (20, 0, 0), but at (200, 0, 0) in left.csv"
+    assert farthest in refusal(left, moved)
+    with pytest.raises(InputError, match=re.escape(farthest)):
+        check_one_target({"a": left, "b": moved})
 
 
 def test_coordinates_in_another_unit_have_nothing_in_common() -> None:
