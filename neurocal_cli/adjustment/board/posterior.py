@@ -124,7 +124,8 @@ _MOST = {"stretch": 3e-2, "lean": 2e-3}
 _NO_GAIN = 0.002
 _NO_GAIN_YET = 0.5  # the same from arbitrary initial sizes, around a target that will still move
 # Longest step of the logarithm of a size, and largest factor by which it grows. With these, 48 boards of
-# eight shapes in 5 to 40 views need 6.4 solutions of the system; with longest steps of 2 and 5, 6.9 and 6.6.
+# eight shapes in 5 to 40 views need 15.5 solutions of the system; with longest steps of 2 and 5, 15.9 and
+# 15.5.
 _LONGEST, _GROWTH = 3.0, 7.0
 _LEAST_CURVATURE = 1e-3  # of the log evidence by the logarithm of a size: absent parts have none
 _AT_MOST = 2.0  # times the promised gain, which is that of a quadratic
