@@ -190,27 +190,42 @@ def spread_of_open(arrow: Arrowhead, variance: float, prior: OpenPrior) -> Sprea
     minus predicted. `variance` is that of the residuals, enlarged if they are correlated.
     """
     reduced, _ = arrow.reduced(RIDGE)
-    S, g = reduced[:-1, :-1], reduced[:-1, -1]
-    c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
-    T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
-    # Schur complement: J^T J and J^T r of the open unknowns at 0, with all others eliminated.
-    left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) / variance
-    right = (g[o] + T.T @ g[c]) / variance + left @ prior.value
     size, logarithm, is_none = _models(prior)
-    # In units of the prior; nan if rounding dominates.
-    P = inverse_or_nan(np.eye(len(o)) + size[:, :, None] * left * size[:, None, :])
-    mean = (P @ (size * right)[..., None])[..., 0]
-    logarithm = logarithm + 0.5 * (size * right * mean).sum(axis=1) + 0.5 * np.linalg.slogdet(P)[1]
-    weight = np.exp(logarithm - logarithm.max())
-    weight /= weight.sum()
-    away = size * mean - prior.value
-    second = size[:, :, None] * P * size[:, None, :] + away[:, :, None] * away[:, None, :]
-    E = _beyond(np.einsum("m,mij->ij", weight, second), left, prior.left_out[prior.is_open])
-    follow = np.zeros((len(prior.is_open), len(o)))
-    follow[c], follow[o] = T, np.eye(len(o))
+    second, follow, left, weight = averaged(
+        reduced[:-1, :-1] / variance, reduced[:-1, -1] / variance, prior.is_open, prior.value,
+        size[:, :, None] * np.eye(size.shape[1]), logarithm,
+    )  # fmt: skip
+    E = _beyond(second, left, prior.left_out[prior.is_open])
     if not np.isfinite(E).all():
         return None
     return SpreadOfOpen(E, follow, float(1.0 - weight[is_none].sum()))
+
+
+def averaged(
+    S: Array, g: Array, is_open: NDArray[np.bool_], value: Array, roots: Array, logarithm: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Second moment E (o, o) of the open unknowns around their values (o,), averaged over m priors.
+
+    S (f, f) and g (f,) are the information on all unknowns without the prior, and the gradient at these
+    values. `roots` (m, o, o) are roots of the prior covariances, `logarithm` (m,) their log probabilities.
+    The other results are the response [T; 1] (f, o) of all unknowns, the information (o, o) on the open ones
+    with the others eliminated, and the weights (m,) of the priors. E is nan if rounding dominates.
+    """
+    c, o = np.flatnonzero(~is_open), np.flatnonzero(is_open)
+    T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
+    left = S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T
+    turned = np.swapaxes(roots, 1, 2)
+    right = turned @ (g[o] + T.T @ g[c] + left @ value)
+    P = inverse_or_nan(np.eye(len(o)) + turned @ left @ roots)  # in units of the prior
+    mean = (P @ right[..., None])[..., 0]
+    logarithm = logarithm + 0.5 * (right * mean).sum(axis=1) + 0.5 * np.linalg.slogdet(P)[1]
+    weight = np.exp(logarithm - logarithm.max())
+    weight /= weight.sum()
+    away = (roots @ mean[..., None])[..., 0] - value
+    second = roots @ P @ turned + away[:, :, None] * away[:, None, :]
+    follow = np.zeros((len(g), len(o)))
+    follow[c], follow[o] = T, np.eye(len(o))
+    return np.einsum("m,mij->ij", weight, second), follow, left, weight
 
 
 def opened(

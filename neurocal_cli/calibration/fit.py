@@ -7,8 +7,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.observability import check_points
@@ -23,7 +21,7 @@ from neurocal_cli.calibration.lens_choice.given_model import (
     with_denominator_if_supported,
     with_more_starts,
 )
-from neurocal_cli.calibration.verdict.findings import LEVEL
+from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.camera.state import CameraState
@@ -210,11 +208,7 @@ def _turned(solution: Solution) -> Solution:
 
 
 def shows_skew(solution: Solution) -> bool:
-    """Whether theta, held at 90 degrees by the solution, has the evidence that causes of errors need.
-
-    The log odds of one more unknown are n/2 log(c / c') - log(n)/2, for squared errors c and c' without and
-    with it, and n independent equations, fewer where neighbouring residuals are alike.
-    """
+    """Whether theta, held at 90 degrees by the solution, has the evidence that causes of errors need."""
     problem = solution.problem
     free = problem.free.copy()
     free[_SKEW] = True
@@ -224,4 +218,4 @@ def shows_skew(solution: Solution) -> bool:
         return False
     alike = correlation(problem.views, point_residuals(problem.views, solution.state))
     n = effective_number(max(problem.views.n_equations - skewed.n_parameters, 1.0), alike)
-    return bool(0.5 * n * np.log(cost / with_it) - 0.5 * np.log(n) > LEVEL)
+    return log_odds(cost, with_it, n, 1) > LEVEL

@@ -32,6 +32,7 @@ from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back
+from neurocal_cli.calibration.verdict.findings import log_odds
 from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, WITH_PRISM
 from neurocal_cli.camera.state import CameraState
@@ -111,7 +112,7 @@ def with_denominator_if_supported(solution: Solution) -> Solution:
     alike = correlation(views, point_residuals(views, found.state))
     n = effective_number(views.n_equations, alike)
     before, after = (max(total_cost(a), 1e-300) for a in (solution.adjusted, found))
-    told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + DECISIVE
+    told = log_odds(before, after, n, len(DENOMINATOR)) > 0.5 * DECISIVE
     better = told and folds_back(problem, found.state) is None
     if not better and folds_back(problem, solution.state) is None:
         return solution
@@ -186,7 +187,7 @@ def _that_suffices(problem: Problem, adjusted: Adjusted) -> str:
             continue
         simpler = problem.with_model(model)
         found = simpler.adjust(start, _STEPS_OF_SIMPLER)
-        as_well = n * np.log(total_cost(found) / max(cost, 1e-300)) < more * np.log(n)
+        as_well = log_odds(total_cost(found), max(cost, 1e-300), n, more) < 0
         if as_well and folds_back(simpler, found.state) is None:
             return model
     return ""

@@ -33,8 +33,8 @@ import numpy as np
 
 from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.cross_validation import Minimum, held_out_views, reduced
-from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.adjustment.open_choices import fisheye_sizes
+from neurocal_cli.adjustment.normal_equations import unit_diagonal
+from neurocal_cli.adjustment.open_choices import averaged, fisheye_sizes
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import normal_blocks
@@ -194,29 +194,9 @@ def averaged_over_sizes(
     """
     is_profile = np.zeros(len(H), dtype=bool)
     is_profile[profile] = True
-    T = -solve_scaled(H[np.ix_(~is_profile, ~is_profile)], H[~is_profile, profile])
-    told = H[profile, profile] + H[profile, ~is_profile] @ T
-    information = right[profile] + T.T @ right[~is_profile] + told @ value
-    follow = np.zeros((len(H), len(value)))
-    follow[profile], follow[~is_profile] = np.eye(len(value)), T
-    E = _second_moment(told, information, value, *priors)
+    roots = np.linalg.cholesky(priors[0])
+    E, follow, *_ = averaged(H, right, is_profile, value, roots, priors[1])
     return np.asarray(covariance + follow @ (E - covariance[profile, profile]) @ follow.T)
-
-
-def _second_moment(
-    told: Array, information: Array, value: Array, covariances: Array, logarithm: Array
-) -> Array:
-    """E, from the profile's J^T J and J^T r at 0."""
-    root = np.linalg.cholesky(covariances)
-    turned = np.swapaxes(root, 1, 2)
-    G = np.eye(len(told)) + turned @ told @ root
-    P = root @ np.linalg.inv(G) @ turned
-    mean = P @ information
-    logarithm = logarithm + 0.5 * (mean @ information - np.linalg.slogdet(G)[1])
-    weight = np.exp(logarithm - logarithm.max())
-    away = mean - value
-    second = P + away[:, :, None] * away[:, None, :]
-    return np.asarray(np.tensordot(weight / weight.sum(), second, axes=1))
 
 
 def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:
