@@ -194,7 +194,7 @@ def averaged_over_sizes(
     """
     is_profile = np.zeros(len(H), dtype=bool)
     is_profile[profile] = True
-    roots = np.linalg.cholesky(priors[0])
+    roots = np.asarray(np.linalg.cholesky(priors[0]), dtype=float)
     E, follow, *_ = averaged(H, right, is_profile, value, roots, priors[1])
     return np.asarray(covariance + follow @ (E - covariance[profile, profile]) @ follow.T)
 
