@@ -266,7 +266,7 @@ _OPTIONS = [
         "coefficients. fisheye, omnidir, double_sphere and eucm are for wide lenses, also beyond 180 "
         "degrees. rich is a fisheye with a smooth displacement of the image, for lenses that no other model "
         "describes. "
-        "auto chooses from none to rational and fisheye, by cross-validation error and number of "
+        "auto chooses from none to rational and fisheye, by error and number of "
         "coefficients, takes omnidir for wide lenses that are decentred, and rich where it predicts views "
         "left out decidedly better than any other. "
         "plumb-line estimates k1, k2, p1 and p2 from the straight lines of the target alone.",

@@ -45,7 +45,7 @@ _USUAL = "none k1 k1k2 k1k2p1p2 plumb_bob rational"
 MODELS = f"{_USUAL} thin_prism tilted fisheye omnidir double_sphere eucm"
 """Distortion models with a formula. A test compares the choices of `calibrate` with those of the library."""
 COMMON_MODELS = f"auto {_USUAL} fisheye"
-"""Those from which "auto" chooses by cross-validation."""
+"""Those from which "auto" chooses."""
 
 _OF_THE_GROUP = ("-q", "--quiet", "-v", "--verbose")
 _FEW = 10  # options that need no headings

@@ -151,7 +151,7 @@ def test_the_summary_says_among_which_models_the_lens_was_chosen(
     calibration = replace(made_calibration(3), lens_choice=errors, distortion_model=model)
     calibration = replace(calibration, distortion=np.zeros(len(coefficient_names(model))), judgement=None)
     std = dict(calibration.std) | dict.fromkeys(coefficient_names(model), 1.0)
-    line = f"distortion model: {model}, chosen by cross-validation error and number of {told}"
+    line = f"distortion model: {model}, chosen by error and number of {told}"
     assert line in calibration_report(replace(calibration, std=std)).splitlines()
 
 

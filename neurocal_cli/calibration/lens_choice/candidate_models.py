@@ -47,13 +47,9 @@ _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 _CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
 _SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
 _BEHIND = 1.5  # times the squared error of a richer model, from which on a model is fitted again
-_LEAST_PENALTY = 7.9  # chi-squared of a superfluous coefficient, exceeded in one case of 200
-# Share of the gain required by the criterion that the rational model must predict; with less, it was never
-# selected (test_model_selection.py, slow: 100 scenes).
-_PROMISING = 0.5
-# The selection admits a model with this number of coefficients more than another one only if it lowers the
-# rms error of held-out data by this factor.
-MORE, FAR_BETTER = 2, 1.25
+# Chi-squared per coefficient that the rational model must promise; with less, it was never selected
+# (test_model_selection.py, slow: 100 scenes).
+_PROMISING = 4.0
 _ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
 _SPARE = 1.3  # fewest equations per unknown
@@ -96,13 +92,9 @@ class Candidate:
         """Sum of squared errors of data that are held out."""
         return float(self.lost.sum())
 
-    def criterion(self, n: float, least: float = _LEAST_PENALTY) -> float:
-        """Bayesian information criterion (Schwarz 1978) for n independent residuals.
-
-        `least` is the lowest penalty of a coefficient.
-        """
-        penalty = max(np.log(n), least) * self.coefficients
-        return float(n * np.log(max(self.cost, 1e-300)) + penalty)
+    def criterion(self, n: float) -> float:
+        """Bayesian information criterion (Schwarz 1978) for n independent residuals."""
+        return float(n * np.log(max(self.cost, 1e-300)) + np.log(n) * self.coefficients)
 
 
 def supported(problem: Problem, model: str) -> Problem | None:
@@ -201,9 +193,7 @@ class _Chain:
         if not np.isfinite(S).all():
             return False
         gain = float(g @ np.linalg.lstsq(S, g, rcond=_ROUNDING)[0])
-        return (
-            gain < _PROMISING * _LEAST_PENALTY * _NEW["rational"] * simpler.cost / rational.views.n_equations
-        )
+        return gain < _PROMISING * _NEW["rational"] * simpler.cost / rational.views.n_equations
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
         """Fit a model again from the next richer one if it is missing or far worse than that."""
@@ -267,7 +257,7 @@ class _Chain:
             c.not_monotonic == "image"
             and not c.noise
             and c.cost <= _BEHIND * lowest
-            and (self.wanted == c.problem.distortion.model if self.wanted else not _too_rich(c, fitted))
+            and self.wanted in (None, c.problem.distortion.model)
             for c in fitted
         ]
         if not any(near) or falls_short(fitted):
@@ -319,16 +309,6 @@ def _assessed(
     except DegenerateGeometryError:
         determined = False
     return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
-
-
-def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:
-    """Whether a sound model with far fewer coefficients predicts too well for this one to be selected."""
-    return any(
-        c.sound
-        and c.coefficients + MORE < candidate.coefficients
-        and c.held_out <= FAR_BETTER**2 * candidate.held_out
-        for c in fitted
-    )
 
 
 def falls_short(fitted: Iterable[Candidate]) -> bool:

@@ -1,19 +1,13 @@
 """``--distortion auto``: select the simplest distortion model that the data support.
 
-The models from `none` to `rational` and the fisheye are fitted, each starting from a simpler one.
-They are compared by their cross-validation error in five folds of the views (or of the points of a single
-view, and of three views if these are predicted as well). The model with the lowest error is tied with all
-models whose error is within 0.9 % of it, and with simpler models whose error exceeds it by at most the
-standard error of the five folds. Among the tied models the Bayesian information criterion (Schwarz 1978)
-decides, n log E + p log n, where n is the effective number of residuals: it accounts for the correlation of
-neighbours and for views that repeat a pose (`repeated_poses`), which also share a fold.
+The models from `none` to `rational` and the fisheye are fitted, each starting from a simpler one. The
+Bayesian information criterion (Schwarz 1978) decides, n log E + p log n, where n is the effective number of
+residuals: it accounts for the correlation of neighbours and for views that repeat a pose (`repeated_poses`).
 
-Models with over two coefficients more than the criterion alone would select are excluded, unless they predict
-far better than all others. Also excluded are models that did not converge, have too few points, or are not
-monotonic (`monotonic_fit`). Models whose coefficients are strongly correlated must lower the cross-validation
-error over several views by 5 %. Models of wide lenses (`WIDE`) are candidates only if points lie far from the
-axis and the criterion decidedly favours them over all ordinary models, because near the axis all lenses are
-alike.
+Excluded are models that did not converge, have too few points, or are not monotonic (`monotonic_fit`). Models
+whose coefficients are strongly correlated must lower the cross-validation error over several views by 5 %.
+Models of wide lenses (`WIDE`) are candidates only if points lie far from the axis and the criterion decidedly
+favours them over all ordinary models, because near the axis all lenses are alike.
 """
 
 from __future__ import annotations
@@ -29,8 +23,6 @@ from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.candidate_models import (
-    FAR_BETTER,
-    MORE,
     Candidate,
     falls_short,
     fit_candidates,
@@ -48,11 +40,8 @@ from neurocal_cli.camera.geometry import Array
 _TIE = 0.009  # relative difference of rms errors that counts as equal
 # "Decidedly better" means by this number of standard errors over the five folds, and by this factor.
 _CERTAIN = 2.0
-# Two views of a board hardly determine the camera that predicts a third one, so too simple lenses seem to
-# predict it best, and what they leave is taken for a bent board: 8 of 297 boards in three views by random
-# cameras, of which one is left if points are held out where these are predicted as well.
-_FEW_POSES = 4
 _DECIDEDLY = 1.03
+_FAR_BETTER = 1.25  # factor by which a decentred wide lens must lower the rms error of ordinary ones
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
 
@@ -76,10 +65,6 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     if not repeated.none:
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
-    if by_views and repeated.n_poses < _FEW_POSES:
-        by_points = judged_again(fitted, False, repeated)
-        if by_points and _least_held_out(by_points) <= _DECIDEDLY**2 * _least_held_out(fitted):
-            fitted = by_points
     name, good = _best(fitted, views, repeated)
     chosen = fitted[preferred if preferred in good else name]
     n, px = len(views.index), views.pixel_scale
@@ -145,55 +130,32 @@ def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = No
     return bool(np.isfinite(held_out_views(problem.minimum(adjusted, repeated))).all())
 
 
-def _least_held_out(fitted: dict[str, Candidate]) -> float:
-    return min(candidate.held_out for candidate in fitted.values())
-
-
 def _best(
     fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses
 ) -> tuple[str, AbstractSet[str]]:
-    """The model with the lowest criterion among those tied for the lowest cross-validation error.
+    """The model with the lowest criterion, and all that no other one predicts decidedly better than.
 
-    The second result is all models that no other one predicts decidedly better than, without simpler ones
-    that are far less probable.
-
-    Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
-    models, but among many models one is the best by chance. The least penalty does not count here: where the
-    residuals are worth few independent ones, it would exclude any lens.
+    Simpler ones that are far less probable are not among the latter.
     """
     eligible = _eligible(fitted, views.n_views > 1)
     n = worth(views, eligible.values()) * repeated.worth
     sound = _eligible(_without_wide(fitted, n), views.n_views > 1)
-    criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
-    most = min(sound.values(), key=lambda c: c.criterion(n, least=0.0)).coefficients + MORE
     finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
-    few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
-    if not few:
+    if not finite:
         return next(iter(sound)), set()  # cross-validation is impossible, so the simplest
-    pool = {
-        name: candidate
-        for name, candidate in finite.items()
-        if name in few
-        or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, FAR_BETTER) for c in few.values())
-    }
-    best = min(pool, key=lambda name: pool[name].held_out)
-    tied = []
-    for name, candidate in pool.items():
-        excess = _by_fold(candidate.lost - pool[best].lost, repeated)
-        chance = np.sqrt(len(excess)) * excess.std()
-        simpler = candidate.coefficients < pool[best].coefficients
-        if excess.sum() <= max(2 * _TIE * pool[best].held_out, chance if simpler else 0.0):
-            tied.append(name)
-    chosen = min(tied, key=lambda name: criterion[name])
-    enough = pool[chosen].coefficients
+    name = min(finite, key=lambda name: finite[name].criterion(n))
+    chosen, best = finite[name], min(finite.values(), key=lambda c: c.held_out)
     good = {
-        name
-        for name, candidate in eligible.items()
+        other
+        for other, candidate in eligible.items()
         if np.isfinite(candidate.lost).all()
-        and (candidate.coefficients > enough or candidate.criterion(n) < criterion[chosen] + DECISIVE)
-        and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
+        and (
+            candidate.coefficients > chosen.coefficients
+            or candidate.criterion(n) < chosen.criterion(n) + DECISIVE
+        )
+        and not predicts_decidedly_better(best.lost, candidate.lost, repeated, _DECIDEDLY)
     }
-    return chosen, good
+    return name, good
 
 
 def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate]:
@@ -209,7 +171,7 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
         if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
     # Ordinary lenses may be decentred as well.
-    far = min(c.cost for c in ordinary) / FAR_BETTER**2
+    far = min(c.cost for c in ordinary) / _FAR_BETTER**2
     return {name: c for name, c in kept.items() if name != "omnidir" or "fisheye" in kept or c.cost < far}
 
 

@@ -151,7 +151,7 @@ def _training_lines(calibration: Calibration) -> list[str]:
         ]
     if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
         errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
-        how = f"chosen by cross-validation error and number of coefficients{_among(calibration)}"
+        how = f"chosen by error and number of coefficients{_among(calibration)}"
         lines += [
             f"distortion model: {calibration.distortion_model}, {how}:",
             f"  {', '.join(errors)} px",
