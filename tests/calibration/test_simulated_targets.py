@@ -64,6 +64,15 @@ def test_the_bends_of_three_views_are_found_with_the_camera(seed: int) -> None:
         assert abs(getattr(camera.intrinsics, name) - true) < 3 * camera.std[name], name
 
 
+def test_a_board_that_is_bent_by_much_is_found_with_its_lens() -> None:
+    """It is bent by 4.8 of 250 mm, and the lens that fits it best as given is too simple."""
+    points, truth = photographed("parabola", 0, 12, 4.0)
+    camera = calibrate(points)
+    assert camera.target is not None
+    assert camera.distortion_model == truth.model
+    assert abs(camera.intrinsics.alpha_u - truth.K[0, 0]) < 3 * camera.std["alpha_u"] < 3.0
+
+
 def test_two_views_of_one_plane_are_poor() -> None:
     points, _ = photographed("flat", 9, 2, 0.0, sigma=0.05)
     verdict = calibrate(points, skew=False).verdict
