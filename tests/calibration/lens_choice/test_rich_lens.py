@@ -99,7 +99,7 @@ def test_auto_takes_it_for_a_mustache_lens_and_says_so(rich: Calibration) -> Non
 
 def test_auto_does_not_take_it_for_a_bent_board() -> None:
     # It is bent by more than a target may be that is found.
-    points, _ = photographed("parabola", 0, 12, 10.0)
+    points, _ = photographed("parabola", 0, 12, 24.0)
     found = calibrate(points)
     assert found.target is None
     assert found.rmse_px > 5 * 0.1
