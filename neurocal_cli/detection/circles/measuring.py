@@ -42,7 +42,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     find_sharpening,
     profile,
 )
-from neurocal_cli.detection.fitting.grid_fit import map_of_vertices
+from neurocal_cli.detection.fitting.grid_fit import map_of_vertices, wide_if_needed
 from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
@@ -171,7 +171,10 @@ def _distances(
 
 
 _AROUND = 3  # found circles around one that was not recognised
-_ROUNDS = 3
+_ROUNDS, _MOST_ROUNDS = 3, 8
+_SETTLED = (
+    0.5  # standard deviations of a centre, rms movement of the map after which no other round is needed
+)
 _STEPS = 8  # Gauss-Newton steps
 _FIRST_BLUR = 1.2  # px
 _LOOSE = 0.3  # relative prior standard deviation of levels and blur
@@ -197,7 +200,7 @@ def measure_circles(
     places = plane.spread(index.astype(float))
     apart = np.sqrt(2) if plane.asymmetric else 1.0
     blur, shading = _FIRST_BLUR, None
-    for _ in range(_ROUNDS):
+    for done in range(1, _MOST_ROUNDS + 1):
         band = _band(light, found.map, places, radius, _ROOM * apart)
         pixels = outline_pixels(light, found.map, places, radius, blur, band, shading)
         fit = _fitted(pixels, blur, floor)
@@ -208,8 +211,9 @@ def measure_circles(
             return measure_circles(undone, plane, circles, floor * gained, undo=False)
         undo = False
         centre = found.map.at(places) + fit.values[:, :2]
-        mapped, departure = _mapped(found, places, centre, fit)
+        mapped, departure = _mapped(raw, found, places, centre, fit)
         good = is_reliable(fit, departure)
+        moved = np.sqrt(((mapped.map.at(places) - found.map.at(places)) ** 2).mean())
         found = mapped
         # The first blur may be far from the true one, which is_reliable does not allow.
         some = good if good.any() else fit.step < 1
@@ -218,6 +222,8 @@ def measure_circles(
         blur = upper_median(fit.values[some, BLUR])
         radius *= 1 + upper_median(fit.values[some, 2]) / _pixel_radius(found.map, places, radius)
         shading = _shading(found.map, places, fit, some)
+        if done >= _ROUNDS and moved < _SETTLED * np.sqrt(upper_median(fit.covariance[some, 0, 0])):
+            break
     uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
     spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None]
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
@@ -345,12 +351,14 @@ def circle_model(data: CirclePixels, values: Array, shape: ProfileShape) -> Line
     return Linearised(rows, z, x)
 
 
-def _mapped(found: MapFit, places: Array, centre: Array, fit: BatchFit) -> tuple[MapFit, Array]:
+def _mapped(
+    raw: GridImage, found: MapFit, places: Array, centre: Array, fit: BatchFit
+) -> tuple[MapFit, Array]:
     """The map through measured centres, and their departures from it in standard deviations."""
     n = len(places)
     variance = np.concatenate([np.maximum(fit.covariance[:, k, k], 1e-12) for k in (0, 1)])
     points = replace(Observations.of_points(places, centre, 1.0), variance=variance)
-    mapped = select_map(found.map, points, np.zeros(0))
+    mapped = wide_if_needed(raw, select_map(found.map, points, np.zeros(0)), points)
     expected = variance + np.concatenate(
         [mapped.map.variance(places, np.tile(axis, (n, 1))) for axis in np.eye(2)]
     )

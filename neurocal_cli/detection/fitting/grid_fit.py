@@ -187,10 +187,7 @@ def fit_from(
     chosen, shifts, observations = _selected(
         grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
     )
-    if _may_be_wide(chosen, grid_image.vertices):
-        wide = _wide_if_better(grid_image, chosen, observations)
-        # An uneven board departs from both maps.
-        chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
+    chosen = wide_if_needed(grid_image, chosen, observations)
     good &= chosen.weight[: len(good)] > 0
     noises = PixelNoise(noise, noise, noise)
     first = GridFit(grid_image, lines, fit, chosen, shifts, shading, noises, good)
@@ -231,16 +228,19 @@ def _by_moments(
     return fit_map(found.map, observations, found.shift), sigma, levels, profile
 
 
-def _may_be_wide(found: MapFit, vertices: Array) -> bool:
-    """Whether the excess variance of a map may be due to a wide lens, which `SmoothMap` does not model.
+def wide_if_needed(grid_image: GridImage, found: MapFit, observations: Observations) -> MapFit:
+    """The map of a wide lens instead of a `SmoothMap` that does not model it, as its excess variance tells.
 
     If the lens displaces points only weakly, `SmoothMap` is accurate to hundredths of a pixel, and a larger
-    excess comes from an uneven board.
+    excess comes from an uneven board, which departs from both maps.
     """
     if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
-        return False
-    bend = found.map.bend(vertices)
-    return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
+        return found
+    bend = found.map.bend(grid_image.vertices)
+    if not (bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)):
+        return found
+    wide = _wide_if_better(grid_image, found, observations)
+    return wide if wide.excess < _CLEARLY * found.excess else found
 
 
 def _selected(
@@ -289,10 +289,10 @@ def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, ANCHOR**2)
-    # More accurate edges may need a richer model.
-    richer = first.map.map.models[first.map.model_index :]
+    # More accurate edges may need a richer model, or a simpler one if their curvature was not known.
     shifts = EdgeShifts.of(blur, shading, lines, first.shifts.used)
-    mapped, shifts, _ = _selected(grid_image, first.map, lines, fit, trusted, shifts, richer)
+    models = first.map.map.models
+    mapped, shifts, _ = _selected(grid_image, first.map, lines, fit, trusted, shifts, models)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # An uneven board departs from its map everywhere. No single edge is an outlier for that, but all edges

@@ -39,8 +39,12 @@ _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0
 _SQUARE = slice(_FIRST + _PROFILE, _FIRST + _PROFILE + 2)  # of m and n
 _REST = _SQUARE.stop
-# Lenses free c and a_0, then more and more of the others.
-_LENSES = tuple(tuple(range(8, stop)) for stop in (11, 12, 13, 14, _SQUARE.start, _REST))
+# Lenses free c and a_0, then a_1, then m and n, and then more and more of the others. At the end, m and n
+# would not be tried with an equidistant lens, for which a_1 and a_2 gain nothing.
+_LENSES = (
+    *(tuple(range(8, stop)) for stop in (11, 12)),
+    *((*range(8, stop), *range(_SQUARE.start, _REST)) for stop in (12, 13, 14, _SQUARE.start)),
+)
 # Prior standard deviations of the centre, of the profile beyond a_0, of m and n, and of the polynomial
 # [half diagonals].
 _CENTRE_PRIOR, _PROFILE_PRIOR, _SQUARE_PRIOR, _REST_PRIOR = 0.1, 0.3, 0.02, 0.1
