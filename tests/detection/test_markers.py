@@ -126,6 +126,29 @@ def test_markers_that_contradict_the_columns_are_refused() -> None:
         detect_points(taken(scene, 1).image, wrong)
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_codes_too_small_to_be_read_singly_tell_the_place_of_all(turns: int) -> None:
+    scene = marked_scene(
+        plane_of("charuco:10x8:28:21:DICT_5X5_100", legacy=turns % 2 == 1), 2, 14.0, (240, 180)
+    )
+    picture = taken(scene, 2)
+    image = np.ascontiguousarray(np.rot90(picture.image, turns))
+    found = detect_points(image, scene.board, "vertices")
+    places, _ = truth_of(picture)
+    u, v = np.array([places[name] for name in found.ids]).T
+    height, width = picture.image.shape
+    true = ((u, v), (v, width - 1 - u), (width - 1 - u, height - 1 - v), (height - 1 - v, u))[turns]
+    assert len(found.ids) >= 60
+    assert np.abs(found.pixels - np.stack(true, axis=1)).max() < 0.04
+
+
+@pytest.mark.parametrize("form", ["charuco:9x7:28:21:DICT_5X5_100", "charuco:11x7:28:21:DICT_5X5_100"])
+def test_a_board_of_other_columns_is_refused_although_two_markers_agree(form: str) -> None:
+    scene = marked_scene(plane_of("charuco:10x7:28:21:DICT_5X5_100"), 2, 14.0, (240, 180))
+    with pytest.raises(NoBoardError, match="as if it had another number of columns"):
+        detect_points(taken(scene, 2).image, Board((plane_of(form),)))
+
+
 def test_too_many_markers_for_a_dictionary_are_refused() -> None:
     board = Board((plane_of("charuco:12x10:40:30:DICT_4X4_50"),))
     with pytest.raises(InputError, match="markers up to 59, and DICT_4X4_50 up to 49"):

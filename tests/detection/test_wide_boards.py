@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.marked import errors_of as errors_of_board
+from support.marked import marked_scene, plane_of, taken
 from support.measured import Points, errors_of
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.wide_boards import WideRecipe, in_circle, mixture, wide_picture
 from support.wide_camera import WideCamera
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.fitting.map_fit import WideMap, wide_start
 from neurocal_cli.detection.fitting.smooth_map import Frame
@@ -127,6 +134,27 @@ def test_a_whole_board_is_found_and_measured(name: str) -> None:
     assert vertices_found(shot.image, truth) == (recipe.cols * recipe.rows, 0)
     found = detect_points(shot.image, Board.single(recipe.cols, recipe.rows, 30.0))
     assert len(found.ids) == len(truth.midpoints)
+
+
+@pytest.mark.parametrize(
+    ("form", "square", "seed"), [("asymmetric_circles:4x7:20:14", 30.0, 2), ("chessboard:9x6:28", 44.0, 12)]
+)
+def test_a_board_near_a_fisheye_of_pixels_that_are_not_square_has_a_true_covariance(
+    form: str, square: float, seed: int
+) -> None:
+    size = 480, 360
+    scene = marked_scene(plane_of(form), seed, square, size)
+    focal = size[0] / np.pi
+    lens = Camera(
+        Intrinsics(focal, 1.003 * focal, 240.8, 177.8), Distortion("fisheye", (0.0, 0.0, 0.0, 0.0)), size
+    )
+    nearer = scene.pose.t * [1.0, 1.0, focal / (1.25 * size[0])]
+    picture = taken(replace(scene, camera=lens, pose=replace(scene.pose, t=nearer)), seed)
+    found = detect_points(picture.image, scene.board, "vertices")
+    error, squared = errors_of_board(found, picture)
+    assert len(error) == scene.targets[0].plane.cols * scene.targets[0].plane.rows
+    assert np.sqrt((error**2).mean()) < 0.005
+    assert 0.6 < squared.mean() < 1.8
 
 
 @pytest.mark.slow

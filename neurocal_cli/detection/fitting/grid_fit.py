@@ -184,10 +184,7 @@ def fit_from(
     models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
     shifts = EdgeShifts.of(board_blur(fit, lines, good, mapped.map), shading, lines)
     # Only large shifts matter here; those of paper boards would cost a tenth of the time.
-    chosen, shifts, observations = _selected(
-        grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
-    )
-    chosen = wide_if_needed(grid_image, chosen, observations)
+    chosen, shifts = _selected(grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY)
     good &= chosen.weight[: len(good)] > 0
     noises = PixelNoise(noise, noise, noise)
     first = GridFit(grid_image, lines, fit, chosen, shifts, shading, noises, good)
@@ -252,7 +249,7 @@ def _selected(
     shifts: EdgeShifts,
     models: Sequence[tuple[int, int]],
     share: float = 1.0,
-) -> tuple[MapFit, EdgeShifts, Observations]:
+) -> tuple[MapFit, EdgeShifts]:
     """Select the map through fitted edges with variances (E,) [px^2], and the terms of their shifts.
 
     `share` is that of `EdgeShifts.required`.
@@ -275,7 +272,7 @@ def _selected(
         # Large shifts may have hidden what a richer model would gain.
         if mapped.excess < _CLEARLY * before:
             mapped, observations = selected(mapped.map, required, models[models.index(model) :])
-    return mapped, required, observations
+    return wide_if_needed(grid_image, mapped, observations), required
 
 
 def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
@@ -289,10 +286,11 @@ def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, ANCHOR**2)
-    # More accurate edges may need a richer model, or a simpler one if their curvature was not known.
+    # More accurate edges may need a richer model; or a simpler one, if a wide lens has bent them otherwise.
     shifts = EdgeShifts.of(blur, shading, lines, first.shifts.used)
-    models = first.map.map.models
-    mapped, shifts, _ = _selected(grid_image, first.map, lines, fit, trusted, shifts, models)
+    wide = isinstance(first.map.map, WideMap)
+    models = first.map.map.models[0 if wide else first.map.model_index :]
+    mapped, shifts = _selected(grid_image, first.map, lines, fit, trusted, shifts, models)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # An uneven board departs from its map everywhere. No single edge is an outlier for that, but all edges

@@ -12,6 +12,7 @@ mapped to a plane for the homographies.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,13 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.saddles import Image, interpolate, refine_saddles
-from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.grid import TURNS, Grid, squares_of
 from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.detection.placement import placements
 from neurocal_cli.detection.wide_lens import Flattening
 from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import TagPlane
-from neurocal_cli.observations.marked_cells import Cells, Print, marked_cells, prints
+from neurocal_cli.observations.marked_cells import Cells, Print, marked_cells, pattern_lines, patterns, prints
 
 _NEAR = 4.5  # squares between markers that are compared
 _AGREE, _AGREE_PX = 0.03, 0.6  # squares and px; rms error of two markers in one homography
@@ -39,6 +41,10 @@ _FEWEST = 4  # vertices
 # Vertices that are enough to find one that does not fit those around it, and its distance: squares and px.
 _FEWEST_AROUND, _STRAY, _STRAY_PX = 8, 0.04, 0.7
 _SAME = 1e-6  # squares
+# Of codes that are read together: standard deviations by which their mean correlation is no chance, and the
+# least median one, which those of another board do not have. It is 0.8 with cells of 1.5 px.
+_SURE, LEAST_AGREEMENT = 6.0, 0.35
+_OF_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])  # as in `squares_of`
 
 
 @frozen_dataclass(eq=False)
@@ -51,7 +57,6 @@ class Placed:
     at: NDArray[np.intp]  # (N,) their positions among the cells
     ground: Array  # (N, 4, 2) [squares] their corners on the board
     unsure: bool = False  # whether as many markers agree in another print
-    share: float = 1.0  # of the markers with numbers of the board
 
 
 def place(plane: Plane, marks: Marks) -> Placed | None:
@@ -67,11 +72,65 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
         if len(kept) < 2:
             continue
         if best is None or len(kept) > len(best.at):
-            share = len(kept) / len(some)
-            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], share=share)
+            best = Placed(some.only(kept), how, cells, at[kept], ground[kept])
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
     return best
+
+
+def read_together(plane: Plane, dictionary: str, grid: Grid, image: Image) -> Marks | None:
+    """The markers in the light squares of a grid, by all their codes together; None if these tell no place.
+
+    The light in the cells of the codes is compared with the codes that each place of the grid on the board
+    puts there. Small or blurred codes, of which none tells its own number, tell the place of all.
+    """
+    best: Marks | None = None
+    most = 0.0
+    for how in prints(plane):
+        cells = marked_cells(plane, how)
+        light = ~patterns(plane, cells, dictionary, how)[:, 1:-1, 1:-1]
+        lines = pattern_lines(plane, dictionary)[1:-1]
+        for placement in placements(grid, plane, 0, {}, mirrored=False):
+            turn = np.array(placement.matrix)
+            middle = (cells.cell + 0.5 - placement.offset) @ turn
+            cell = np.floor(middle).astype(np.int64)
+            if ((cell.sum(axis=1) + grid.dark) % 2 == 0).any():
+                continue
+            codes = np.rot90(light, TURNS.index(placement.matrix), axes=(1, 2))
+            which, H, agree = agreement(grid, cell, lines, codes, image)
+            usual = agree.mean() * np.sqrt(agree.size * light[0].size) if len(agree) else 0.0
+            if usual > max(most, _SURE) and np.median(agree) > LEAST_AGREEMENT:
+                corners = (cells.corners[which] - 0.5 - cells.cell[which, None]) @ turn + 0.5
+                best, most = Marks(cells.number[which], homography_at(H, corners), dictionary), usual
+    return best
+
+
+def agreement(
+    grid: Grid, cell: NDArray[np.int64], lines: Array, light: NDArray[Any], image: Image
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """How far the light in the cells of a grid is that of codes.
+
+    Returns which M of the cells have all their vertices, their homographies, and the correlation (M,) of
+    their light with codes (N, n, n), which are in cells (N, 2) between lines (n + 1,) along their sides.
+    """
+    squares = squares_of(grid.pixels)
+    c, r = cell.T
+    inside = (cell >= 0).all(axis=1) & (c < squares.shape[1]) & (r < squares.shape[0])
+    which = np.flatnonzero(inside)
+    which = which[np.isfinite(squares[r[which], c[which]]).all(axis=(1, 2))]
+    at = squares[r[which], c[which]]
+    H = homographies(np.broadcast_to(_OF_SQUARE, at.shape), at)
+    middle = 0.5 * (lines[1:] + lines[:-1])
+    places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
+    seen = interpolate(image, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
+    codes = light[which].reshape(len(which), -1)
+    return which, H, (_standard(seen) * _standard(codes)).sum(axis=1)
+
+
+def _standard(values: NDArray[Any]) -> Array:
+    """Rows (N, K) without their means, and of length 1."""
+    centred = values - values.mean(axis=1, keepdims=True)
+    return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-9))
 
 
 def _agreeing(ground: Array, pixels: Array) -> NDArray[np.intp]:

@@ -10,13 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.saddles import Image, grey_levels
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.markers.ink import Ink
-from neurocal_cli.detection.markers.lattice import Placed, corners_of_tags, find_vertices, place
-from neurocal_cli.detection.markers.reading import USUAL, Marks, codes_in, read_codes, read_markers
+from neurocal_cli.detection.markers.lattice import (
+    LEAST_AGREEMENT,
+    Placed,
+    agreement,
+    corners_of_tags,
+    find_vertices,
+    place,
+    read_together,
+)
+from neurocal_cli.detection.markers.reading import SMALL, USUAL, Marks, codes_in, read_codes, read_markers
 from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
@@ -28,9 +37,6 @@ _ENOUGH = 4  # markers that agree, after which no other dictionary is tried
 _MOST = 0.5  # share of the markers after which no other scale is tried
 _WITH_SQUARES = 0.5  # share of the corners of tags that are vertices if there are squares at them
 _STRANGE = 8  # markers of another dictionary that are worth a word
-# Share of the board's markers that agree with each other, below which so many of them contradict the
-# description.
-_LEAST_SHARE, _CONTRADICTING = 0.45, 6
 _MIRRORED = ((1, 0), (0, -1))
 
 
@@ -50,17 +56,18 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
         if placed is None or found is None:
             read = max(read, 0 if placed is None else len(placed.at))
             continue
-        if placed.share < _LEAST_SHARE and len(placed.at) >= _CONTRADICTING * placed.share:
-            raise NoBoardError(
-                "most markers are not where the board has them, as if it had another number of columns; "
-                "correct its description, or leave out --board, so that the board is found"
-            )
         if placed.unsure:
             raise NoBoardError(
                 "the markers fit today's and the legacy pattern of OpenCV; show more of the board, or give "
                 "legacy: true or false in a board file"
             )
-        located.append(_located(plane, index, placed, *found))
+        one = _located(plane, index, placed, *found)
+        if not _shows_its_codes(one, placed.marks.dictionary, light):
+            raise NoBoardError(
+                "most markers are not where the board has them, as if it had another number of columns; "
+                "correct its description, or leave out --board, so that the board is found"
+            )
+        located.append(one)
         notes.append(_told(plane, placed, found[0]))
     if not located:
         raise NoBoardError(_reason(board, grey, read, quadrangles))
@@ -108,6 +115,9 @@ def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: list[Array]) -> 
         if not named and len(dictionaries) == 1:
             seen = {marks.dictionary for marks, cells in _codes(grey, quadrangles) if cells == border}
             dictionaries += [one for one in USUAL[1:] if one in seen]
+    if best is None and named and not isinstance(plane, TagPlane) and max(grey.shape) <= SMALL:
+        together = (read_together(plane, named, grid, grey_levels(grey)) for grid in find_grids(grey))
+        best = next((place(plane, marks) for marks in together if marks is not None), None)
     return best
 
 
@@ -136,6 +146,17 @@ def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[
     y = plane.spread(np.column_stack([0 * lines_r, lines_r]))[:, 1]
     ink = Ink(cell, within, np.where(dark, -1.0, 1.0), -np.ones(len(cell)))
     return Located(replace(grid, lines=(x - x[0], np.abs(y - y[0]))), plane, placement, ink)
+
+
+def _shows_its_codes(located: Located, dictionary: str, light: Image) -> bool:
+    """Whether most of the squares that have markers on the board show their codes."""
+    ink = located.ink
+    assert ink is not None
+    n = len(ink.lines) - 1
+    code = slice((n - DICTIONARIES[dictionary]) // 2, (n + DICTIONARIES[dictionary]) // 2)
+    lines = ink.lines[code.start : code.stop + 1]
+    agree = agreement(located.grid, ink.cell, lines, ink.light[:, code, code], light)[2]
+    return not len(agree) or float(np.median(agree)) > LEAST_AGREEMENT
 
 
 def _told(plane: Plane, placed: Placed, grid: Grid) -> str:

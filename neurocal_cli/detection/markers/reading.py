@@ -42,7 +42,7 @@ USUAL = (
     "DICT_ARUCO_MIP_36h12",
 )
 _LONGEST = 2200  # px; larger images are halved first, which still shows the markers of boards
-_SMALL, _ENLARGED = 1000, 3.0  # px; smaller images are enlarged by a factor if markers cannot be read
+SMALL, _ENLARGED = 1000, 3.0  # px; smaller images are enlarged by a factor if markers cannot be read
 _WINDOWS = (5, 29, 8)  # px; least and greatest window of the adaptive threshold, and its step
 _SMALLEST = 6.0  # px, least side of a marker
 
@@ -120,7 +120,7 @@ def looks_at(grey: NDArray[np.uint8]) -> Iterator[list[View]]:
             View(np.ascontiguousarray(fine.image[v, u]), fine.scale, (factor * u.start, factor * v.start))
             for v, u in dense_parts(Level(grey_levels(coarse.image), 2 * factor))
         ]
-    if max(grey.shape) <= _SMALL:
+    if max(grey.shape) <= SMALL:
         yield [_scaled(scaled[0], _ENLARGED)]
 
 
