@@ -71,6 +71,9 @@ _GOOD_START = 1.3  # chi2 per coordinate of these vertices below which no richer
 # after the first fit if the excess variance is below _UNEVEN.
 _STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
 _UNEVEN = 100.0
+_EVEN = (
+    10.0  # excess variance of the first fit of an even board, at most; of photographs of paper 40 and more
+)
 _NOT_NOISE, _CLEARLY = 2.0, 0.5  # excess variance above which a wide lens is tried, and share it must leave
 _PARAMETER = 2.0  # chi2 that a parameter must gain, in the choice between the two kinds of lenses
 _MOMENT_SIGMA = 0.05  # px; standard deviation of offsets from moments
@@ -286,11 +289,10 @@ def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, ANCHOR**2)
-    # More accurate edges may need a richer model; or a simpler one, if a wide lens has bent them otherwise.
+    # More accurate edges may need a richer model.
+    richer = first.map.map.models[first.map.model_index :]
     shifts = EdgeShifts.of(blur, shading, lines, first.shifts.used)
-    wide = isinstance(first.map.map, WideMap)
-    models = first.map.map.models[0 if wide else first.map.model_index :]
-    mapped, shifts = _selected(grid_image, first.map, lines, fit, trusted, shifts, models)
+    mapped, shifts = _selected(grid_image, first.map, lines, fit, trusted, shifts, richer)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # An uneven board departs from its map everywhere. No single edge is an outlier for that, but all edges

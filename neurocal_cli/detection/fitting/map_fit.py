@@ -39,12 +39,12 @@ _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0
 _SQUARE = slice(_FIRST + _PROFILE, _FIRST + _PROFILE + 2)  # of m and n
 _REST = _SQUARE.stop
-# Lenses free c and a_0, then a_1, then m and n, and then more and more of the others. At the end, m and n
-# would not be tried with an equidistant lens, for which a_1 and a_2 gain nothing.
+# Lenses free c and a_0, then more and more of the others; the last one all but a_2 to a_5.
 _LENSES = (
-    *(tuple(range(8, stop)) for stop in (11, 12)),
-    *((*range(8, stop), *range(_SQUARE.start, _REST)) for stop in (12, 13, 14, _SQUARE.start)),
+    *(tuple(range(8, stop)) for stop in (11, 12, 13, 14, _SQUARE.start, _REST)),
+    (8, 9, 10, 11, *range(_SQUARE.start, _REST)),
 )
+_ALL, _SIMPLE = 5, 6
 # Prior standard deviations of the centre, of the profile beyond a_0, of m and n, and of the polynomial
 # [half diagonals].
 _CENTRE_PRIOR, _PROFILE_PRIOR, _SQUARE_PRIOR, _REST_PRIOR = 0.1, 0.3, 0.02, 0.1
@@ -57,11 +57,14 @@ class WideMap(SmoothMap):
     """A map with its parameters h, c, a, m, n, b, some of which may be fixed at 0."""
 
     models: ClassVar[tuple[tuple[int, int], ...]] = (
-        *((k, 0) for k in range(len(_LENSES))),
-        *((len(_LENSES) - 1, degree) for degree in (3, 4, 5, 6)),
+        *((k, 0) for k in range(_ALL + 1)),
+        *((_ALL, degree) for degree in (3, 4, 5, 6)),
     )
-    richest_lens: ClassVar[int] = len(_LENSES) - 1
-    lens_models: ClassVar[tuple[tuple[int, int], ...]] = models[: len(_LENSES)]
+    # An equidistant lens with pixels that are not square gains nothing by a_1 and a_2 alone, after which no
+    # others would be tried.
+    simple_models: ClassVar[tuple[tuple[int, int], ...]] = ((0, 0), (1, 0), (_SIMPLE, 0))
+    richest_lens: ClassVar[int] = _ALL
+    lens_models: ClassVar[tuple[tuple[int, int], ...]] = models[: _ALL + 1]
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _LENSES
     square: ClassVar[slice] = _SQUARE
     rest: ClassVar[int] = _REST
@@ -175,6 +178,7 @@ _PRICE, _UNEVEN_PRICE = 2.25, 3.0
 _MOST_UNKNOWNS, _MOST_OF_LENS = 0.5, 0.92
 _FIRST_SHARE = 0.3  # share of that price which the first step must gain for the fit to continue
 _FUTILE = 2  # richer lens models, or polynomials, without gain, after which no more are tried
+_NOISE = 2.0  # greatest excess variance of residuals that are noise alone
 _UNEVEN = 4.0  # ratio of residuals to noise above which polynomials are tried although no lens model gained
 
 
@@ -228,7 +232,7 @@ class MapFit:
     @property
     def model_index(self) -> int:
         """Index of the map's model in its `models`."""
-        return self.map.models.index((self.map.radial, self.map.degree))
+        return self.map.models.index((min(self.map.radial, self.map.richest_lens), self.map.degree))
 
 
 def fit_map(start: SmoothMap, observations: Observations, shift: Array) -> MapFit:
@@ -246,8 +250,13 @@ def select_map(
     """Fit the simplest model that the observations do not contradict, from a map of any model.
 
     No richer model is tried once chi2 per observation is below `enough`. The `models` (radial, degree) are
-    tried from the simplest to the richest; by default all of the map's `models`.
+    tried from the simplest to the richest; by default all of the map's `models`. Without `enough`,
+    the `simple_models` of a map come before these, and suffice if they leave noise alone.
     """
+    if start.simple_models and not enough and models is not start.simple_models:
+        simple = select_map(start, observations, shift, models=start.simple_models)
+        if simple.excess < _NOISE:
+            return simple
     best: _Solution | None = None
     now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials
     informative, precision = observations.informative, 1 / np.sqrt(observations.variance)

@@ -99,6 +99,7 @@ class SmoothMap:
     models: ClassVar[tuple[tuple[int, int], ...]] = (
         (0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6)
     )  # fmt: skip
+    simple_models: ClassVar[tuple[tuple[int, int], ...]] = ()
     richest_lens: ClassVar[int] = 3  # index of the richest model without a polynomial
     # Those of the lens alone, for places where a polynomial extrapolates badly.
     lens_models: ClassVar[tuple[tuple[int, int], ...]] = tuple((k, 0) for k in range(len(_FREE_LENS)))
