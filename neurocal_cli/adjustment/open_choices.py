@@ -283,8 +283,11 @@ def open_stretch(found: Covariance, m: Minimum, world: Array, variance: float) -
 
     The first columns are those of the free parameters of the camera, which is at its minimum for the given
     target. The variance is that of the residuals, enlarged if they are correlated. The covariance stays as it
-    is, and the probability is 0, if the stretch is negligible.
+    is, and the probability is 0, if the stretch is negligible, and for one view of a target that is not flat:
+    in it, a stretched target is another camera.
     """
+    if m.views.n_views == 1 and not is_flat(world):
+        return found, 0.0
     by = stretches(world)
     normal = stretched_blocks(m.views.batches, m.state, by)
     arrow = replace(m, normal=normal, free=np.append(m.free, np.ones(len(by), dtype=bool))).arrow
