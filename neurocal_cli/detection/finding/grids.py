@@ -22,7 +22,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.appearance import are_squares
 from neurocal_cli.detection.finding.grow import grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
-from neurocal_cli.detection.finding.links import Links, find_links, find_seeds, linked_group
+from neurocal_cli.detection.finding.links import Links, find_links, find_seeds
 from neurocal_cli.detection.finding.overlaps import (
     drop_duplicates,
     merge_lattices,
@@ -165,7 +165,8 @@ def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozense
         if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
-        grid = remove_outliers(level, grow(level, _linked(links, int(seed[1, 1]))))
+        first = Lattice(saddles.points[seed], saddles.contrast[seed], 0)
+        grid = remove_outliers(level, grow(level, first))
         boards = [x for x in _boards(grid) if is_smooth(level, x)]
         if boards:
             found += boards
@@ -176,17 +177,6 @@ def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozense
         if tries <= 0:
             break
     return found
-
-
-def _linked(links: Links, middle: int) -> Lattice:
-    """The lattice that links from a saddle make, whose port 0 points along c."""
-    places, members = linked_group(links, middle)
-    cols, rows = places.max(axis=0) + 1
-    at = places[:, 1], places[:, 0]
-    pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
-    pixels[at], contrast[at] = links.saddles.points[members], links.saddles.contrast[members]
-    # The square between ports 0 and 1 of the middle saddle is dark.
-    return Lattice(pixels, contrast, int(places[members == middle].sum()) % 2).cropped()
 
 
 def _find_slivers(level: Level, links: Links) -> list[Lattice]:
