@@ -71,9 +71,6 @@ _GOOD_START = 1.3  # chi2 per coordinate of these vertices below which no richer
 # after the first fit if the excess variance is below _UNEVEN.
 _STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
 _UNEVEN = 100.0
-_EVEN = (
-    10.0  # excess variance of the first fit of an even board, at most; of photographs of paper 40 and more
-)
 _NOT_NOISE, _CLEARLY = 2.0, 0.5  # excess variance above which a wide lens is tried, and share it must leave
 _PARAMETER = 2.0  # chi2 that a parameter must gain, in the choice between the two kinds of lenses
 _MOMENT_SIGMA = 0.05  # px; standard deviation of offsets from moments
