@@ -183,6 +183,13 @@ class Target:
             radius, n = radius + float((given**2).sum()), n + len(given)
         return float(np.sqrt(squares / n)), MISPRINT * float(np.sqrt(radius / n))
 
+    def std_of_sides(self) -> float:
+        """Std of a flat target's stretch: twice that of its points in their plane, over their radius."""
+        centred = self.given - self.given.mean(axis=0)
+        along = np.linalg.svd(centred, full_matrices=False)[2][:2]
+        squares = (self.std**2 @ (along**2).T).sum()
+        return float(2.0 * np.sqrt(squares / (centred**2).sum()))
+
     def std_of_scale(self) -> float:
         """Relative std of the scale, if the description is wrong as no print is; else 0.
 

@@ -343,7 +343,7 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
             "measure the target, turn it by 90 degrees in some views, or give --no-skew",
         )
     yield (
-        STRETCHED_PRINT.grade(abs(stretch)),
+        STRETCHED_PRINT.grade(abs(stretch) - TOLD * target.std_of_sides()),
         f"the target is {100 * np.expm1(abs(stretch)):.2g} % longer along {longer}, compared with {other}, "
         f"than described: {WRONG_PRINT}",
         measure,
