@@ -15,19 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import NEARBY, Adjusted, adjust
-from neurocal_cli.adjustment.board.find import (
-    Found,
-    counted_again,
-    find_target,
-    gain_over_given,
-    views_for_target,
-)
+from neurocal_cli.adjustment.board.find import Found, counted_again, gain_over_given, views_for_target
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.free_networks import (
     conditions_on_views,
@@ -40,6 +33,7 @@ from neurocal_cli.adjustment.residual_correlation import correlation, point_resi
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.fit import fit
+from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
 from neurocal_cli.calibration.point_errors import places_of_views, rms
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.effects import BENDS
@@ -48,13 +42,11 @@ from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import causes_among
 from neurocal_cli.calibration.verdict.rivals import SHAPES
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.network.options import options_for
 from neurocal_cli.observations.points import Correspondences
 
-_RICHER = dict(pairwise(POLYNOMIAL_MODELS))
 _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
 
 # Of one view. Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean
@@ -80,7 +72,7 @@ def has_other_cause(
     """
     # One or two views of planes that bend and were set up by hand show distortion as another target.
     n_views = sum(problem.views.n_views for problem, _ in fits)
-    if named_lens and n_views < _TELL_BENDS and _richer_lens_is_better(found):
+    if named_lens and n_views < _TELL_BENDS and richer_lens_is_better(found):
         return True
     fits = views_for_target(fits)
     held = [_contest_at(fit, named_lens, worth) for fit in fits]
@@ -88,18 +80,6 @@ def has_other_cause(
     counted = min(counted_again(found, fits), 1.0)
     others = sum(one.instead_of_target(counted) for one in held if one is not None)
     return others > gain_over_given(found, fits)
-
-
-def _richer_lens_is_better(found: Found) -> bool:
-    """Whether the next distortion model, with another target, explains the data decidedly better."""
-    fits = []
-    for problem, adjusted in found.fits:
-        model = _RICHER.get(adjusted.state.model)
-        if model is None or problem.type == 3:
-            return False
-        new = problem.with_model(model)
-        fits.append((new, new.adjust(adjusted.state.with_model(model))))
-    return find_target(fits, found.target.flat, found.target, least=found.evidence + LEVEL) is not None
 
 
 def contradicts_sigma(solution: Solution) -> bool:

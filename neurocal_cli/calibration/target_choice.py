@@ -38,6 +38,7 @@ from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_intrinsics
 from neurocal_cli.calibration.fit import fit, fit_again
+from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
 from neurocal_cli.calibration.other_causes import contest_of, contradicts_sigma, has_other_cause
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
@@ -67,7 +68,7 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     except NeurocalError:
         return None
     named = not all(camera.lens_choice for camera in cameras)
-    found = find_shape(fits, choice, known)
+    found = find_shape(fits, choice, known, named)
     if found is None:
         return None
     doubtful = named and known is None and choice == "auto"
@@ -105,9 +106,12 @@ def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
     return problem, problem.adjust(normalised(state, problem.views))
 
 
-def find_shape(fits: Sequence[tuple[Problem, Adjusted]], choice: str, known: Target | None) -> Found | None:
-    """Estimate the target as chosen, starting from a known one."""
-    return find_target(fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf)
+def find_shape(
+    fits: Sequence[tuple[Problem, Adjusted]], choice: str, known: Target | None, named: bool
+) -> Found | None:
+    """Estimate the target as chosen, starting from a known one; only a lens that is not named may change."""
+    find = find_target if named or known is not None else find_lens_and_target
+    return find(fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf)
 
 
 def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
@@ -265,7 +269,7 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    return find_shape([(solution.problem, solution.adjusted)], choice, known)
+    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
 
 
 def _fitted_to(

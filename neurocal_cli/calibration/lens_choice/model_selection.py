@@ -1,4 +1,4 @@
-"""``--distortion auto``: select the simplest distortion model that the data support.
+"""``--distortion auto``: select the simplest distortion model that the data support, and lens with target.
 
 The models from `none` to `rational` and the fisheye are fitted, each starting from a simpler one. The
 Bayesian information criterion (Schwarz 1978) decides, n log E + p log n, where n is the effective number of
@@ -8,16 +8,24 @@ Excluded are models that did not converge, have too few points, or are not monot
 whose coefficients are strongly correlated must lower the cross-validation error over several views by 5 %.
 Models of wide lenses (`WIDE`) are candidates only if points lie far from the axis and the criterion decidedly
 favours them over all ordinary models, because near the axis all lenses are alike.
+
+Lens with target. Distortion and a bent board leave similar residuals, so both are selected together. Starting
+from the lens selected for the given target, the next richer model is tried as long as it raises the evidence
+enough. If none does, the next simpler one is tried as long as it hardly lowers it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.board.find import Found, find_target
 from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
+from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution
@@ -31,8 +39,9 @@ from neurocal_cli.calibration.lens_choice.candidate_models import (
 )
 from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, LOWER, Starts, may_lead_lower
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.observations.target import Target
 
 # Repeated by test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
 # 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
@@ -44,6 +53,10 @@ _DECIDEDLY = 1.03
 _FAR_BETTER = 1.25  # factor by which a decentred wide lens must lower the rms error of ordinary ones
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
+_RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
+_SIMPLER = -1.0  # and for a simpler one
+# Nested models: each has the coefficients of the previous one and more.
+_PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
 
 
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
@@ -209,3 +222,46 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
         return sound or monotonic
     lowest = [min(c.held_out for c in some.values()) for some in (sound, monotonic)]
     return sound if lowest[0] < _WORTH**2 * lowest[1] else monotonic
+
+
+def find_lens_and_target(
+    fits: Sequence[tuple[Problem, Adjusted]],
+    flat: bool = False,
+    known: Target | None = None,
+    least_gain: float = -np.inf,
+) -> Found | None:
+    """Estimate the positions of the target's points and select the distortion model; see `find_target`."""
+    best = find_target(fits, flat, known, least_gain)
+    if best is None:
+        return None
+    for step, least in ((1, _RICHER), (-1, _SIMPLER)):
+        moved = False
+        while (other := _with_other_lens(best, step, flat, best.evidence + least)) is not None:
+            best, moved = other, True
+        if moved:
+            break
+    return best
+
+
+def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found | None:
+    """Estimate the target with every camera's next distortion model.
+
+    None at the end of the chain, or if the log evidence is not larger than `least`.
+    """
+    fits = []
+    for problem, adjusted in found.fits:
+        place = _PLACES.get(adjusted.state.model, -2) + step
+        if not 0 <= place < len(POLYNOMIAL_MODELS) or problem.type == 3:
+            return None
+        fits.append(_adjusted_with(problem, adjusted, POLYNOMIAL_MODELS[place]))
+    return find_target(fits, flat, found.target, least=least)
+
+
+def richer_lens_is_better(found: Found) -> bool:
+    """Whether one more distortion coefficient, with another target, explains the data decidedly better."""
+    return _with_other_lens(found, 1, found.target.flat, found.evidence + _RICHER) is not None
+
+
+def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
+    new = problem.with_model(model)
+    return new, new.adjust(adjusted.state.with_model(model))
