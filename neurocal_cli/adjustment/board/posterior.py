@@ -40,7 +40,7 @@ from neurocal_cli.adjustment.board.system import (
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.observations.target import Target
+from neurocal_cli.observations.target import STRETCHED, Target
 
 
 @frozen_dataclass(eq=False)
@@ -110,15 +110,17 @@ _START = {
 # Least gain in log evidence with which a stretch or a lean is estimated, as by the odds in `open_stretch`.
 # With 0, errors from five views of bent boards are 5 to 10 % larger (test_simulated_targets.py, slow).
 _SEEN = math.log(5.0)
+_NEARLY = 0.99  # of the largest size of prints, from which on a wrong description is tried
 _CERTAIN = 500.0  # largest log odds: more overflows
 _LEAST_SHARE = 1e-9  # of its prior variance that a coefficient keeps
 # Least size of the fold over the target's size: planes are set up by hand, not better than to 0.1 mm of 200.
 # Without it, a stretch and a lean may explain one view of two planes, and the centre is off by eight standard
 # deviations (test_folded_targets.py, slow).
 _BY_HAND = 5e-4
-# Largest sizes over the target's size. A wrong description stretches by percents; a skew of the image axes
-# looks like a lean.
-_MOST = {"stretch": 3e-2, "lean": 2e-3}
+_MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
+# Of a flat target that is described wrongly: the least and largest size, half of the difference of two sides,
+# and the log evidence that it has to gain, as all causes.
+_DESCRIBED, _MOST_DESCRIBED, _GAIN = 0.5 * STRETCHED, 3e-2, 6.0
 # Least predicted gain in log evidence of a step. With these, cameras differ by 0.002 standard deviations rms
 # from those with 1e-5; 207 sets of boards of all shapes by tests/support/targets.py.
 _NO_GAIN = 0.002
@@ -206,7 +208,7 @@ def posterior(
     now = climb.climbed(climb.at(np.minimum(start, climb.most / noise)))
     for part in climb.switched if with_stretch else ():
         now = climb.on_or_off(now, part)
-    return climb.posterior(now)
+    return climb.posterior(climb.described(now) if with_stretch else now)
 
 
 def given_posterior(info: Information, prior: Prior) -> Posterior:
@@ -282,6 +284,10 @@ class _Solution:
     variance: float
     evidence: float
 
+    def size(self, part: int) -> float:
+        """Size of a part [world unit]."""
+        return float(self.ratios[part]) * math.sqrt(self.variance)
+
 
 class _Climb:
     """The ascent to the most probable sizes of the parts."""
@@ -304,7 +310,7 @@ class _Climb:
         self.most = np.where(held, self.least, prior.size)
         self.switched = [self.names.index(name) for name in _SWITCHED if name in self.names]
         self.of_prints = STRETCH * prior.size
-        self.most_of_prints = [_MOST.get(name, 0.0) * prior.size for name in self.names]
+        self.most_of_prints, self.size = _MOST * prior.size, prior.size
 
     def at(self, ratios: Array) -> _Solution:
         """The solution for these sizes of the parts."""
@@ -322,13 +328,14 @@ class _Climb:
         least, most = self.least.copy(), self.most.copy()
         for k in self.switched:
             on = self.is_on(now, k)
-            least[k], most[k] = (self.of_prints, self.most_of_prints[k]) if on else (least[k], least[k])
+            of_print = now.size(k) < _DESCRIBED * self.size
+            largest = self.most_of_prints if of_print else _MOST_DESCRIBED * self.size
+            least[k], most[k] = (self.of_prints, largest) if on else (least[k], least[k])
         return least / math.sqrt(now.variance), most / math.sqrt(now.variance)
 
     def is_on(self, now: _Solution, part: int) -> bool:
         """Whether a stretch or a lean has the size of prints."""
-        size = float(now.ratios[part]) * math.sqrt(now.variance)
-        return size > math.sqrt(self.of_prints * self.least[0])
+        return now.size(part) > math.sqrt(self.of_prints * self.least[0])
 
     def changed(self, now: _Solution, new: Mapping[int, float]) -> _Solution:
         """The solution with new ratios of some parts."""
@@ -341,6 +348,17 @@ class _Climb:
         on = self.is_on(now, part)
         size = self.least[0] if on else self.of_prints
         wanted = now.evidence + (-_SEEN if on else _SEEN)
+        other = self.climbed(self.changed(now, {part: size / math.sqrt(now.variance)}), wanted)
+        return other if other.evidence > wanted else now
+
+    def described(self, now: _Solution) -> _Solution:
+        """The solution with a stretch that no print has, if it is far more probable than one of a print."""
+        if "fold" in self.names or "stretch" not in self.names:
+            return now
+        part = self.names.index("stretch")
+        if now.size(part) < _NEARLY * self.most_of_prints:
+            return now
+        wanted, size = now.evidence + _GAIN, 2 * _DESCRIBED * self.size
         other = self.climbed(self.changed(now, {part: size / math.sqrt(now.variance)}), wanted)
         return other if other.evidence > wanted else now
 

@@ -158,9 +158,8 @@ def _distances(rig: Rig) -> tuple[tuple[tuple[str, str], float], tuple[str, str]
     usual = float(median(apart.min(axis=1)))
     worst, together = ((names[0], names[1]), 0.0), None
     target = rig.cameras[names[0]].target
-    of_scale = (
-        0.0 if target is None else target.std_of_scale()
-    )  # of a wrong description, which is told itself
+    # The part of a wrong description is told by itself.
+    of_scale = 0.0 if target is None else target.std_of_scale()
     for k, name in enumerate(names[1:], 1):
         nearest = names[int(np.argmin(apart[k]))]
         pair = rig.pair(nearest, name)

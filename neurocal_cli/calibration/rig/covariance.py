@@ -198,8 +198,8 @@ def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: lis
 def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:
     """Add the stretch of the print to a covariance of all shared unknowns; and the probability of a stretch.
 
-    The probability is 0 if the stretch is negligible. Cameras that were not refined
-    respond to the stretch as well, because they were calibrated on this target.
+    The probability is 0 if the stretch is negligible. Cameras that were not refined respond to the stretch as
+    well, because they were calibrated on this target.
     """
     world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
     if not fit.variance > 0:
