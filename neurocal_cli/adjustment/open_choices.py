@@ -19,8 +19,8 @@ Noise can hide the stretch of a print, and a stretched print biases the focal le
 was kept, two unknowns o are open: a stretch (one side longer than stated) and a lean (sides that are not
 perpendicular). Each is either absent or has a Gaussian prior with the size typical of prints; a lean may also
 be small, as that of most prints. The covariance is that of model averaging over all six models, around the
-reported parameters for the given target. A folded target is stretched as a whole, in any direction: five
-unknowns, which are absent or present together.
+reported parameters for the given target. A folded target in several views is stretched as a whole, in any
+direction: five unknowns, which are absent or present together.
 """
 
 from __future__ import annotations

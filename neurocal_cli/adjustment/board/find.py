@@ -43,7 +43,7 @@ from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.observations.board import planes_of
+from neurocal_cli.observations.board import is_flat, planes_of
 from neurocal_cli.observations.target import (
     N_SHAPES,
     Bends,
@@ -62,9 +62,9 @@ _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _NOT_YET = 5.0  # log evidence that another step may add; without it, 56 sets of all shapes end the same
 _SETTLED = 0.02  # of the cameras' standard deviations
-# Largest offset over the target's size, and largest stretch and inequality of planes set up by hand, of which
-# few views show little; more is another target.
-_LARGEST, _LARGEST_OF_FOLDED, _STRETCHED_FOLDED = 0.1, 0.05, 0.02
+# Largest offset over the target's size, of boards and of others, and largest stretch and inequality of
+# these, of which few views show little; more is another target.
+_LARGEST, _LARGEST_OF_OTHERS, _STRETCHED = 0.1, 0.05, 0.02
 _FEWEST, _FEWEST_OF_FOLDED = 3, 1  # fewest different views of most points
 LEAST_GAIN = 6.0
 """Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
@@ -222,7 +222,8 @@ class Search:
             self.sizes = dict(known.sizes)
         self.label = np.split(label, np.cumsum([len(points) for points in all_points])[:-1])
         self.prior = prior_of(self.given, self.plane)
-        self.largest = (_LARGEST_OF_FOLDED if self.plane.any() else _LARGEST) * self.prior.size
+        self.is_board = is_flat(self.given) and not self.plane.any()
+        self.largest = (_LARGEST if self.is_board else _LARGEST_OF_OTHERS) * self.prior.size
         # Errors of points that are seen once look like noise.
         self.absent = (OUT_OF_PLANE if flat else ()) + (SINGLE if _median_views(label) < 2 else ())
         found = np.zeros_like(self.given) if known is None else known.offsets
@@ -327,7 +328,7 @@ class Search:
             self.given, self._common(), std, self.plane, found.sizes, self.flat, found.evidence - given,
             self.ids, bends=bends,
         )  # fmt: skip
-        if self.plane.any() and max(target.stretch(), target.unequal()) > _STRETCHED_FOLDED:
+        if not self.is_board and max(target.stretch(), target.unequal()) > _STRETCHED:
             return None
         return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
 

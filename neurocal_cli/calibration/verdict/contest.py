@@ -111,11 +111,11 @@ def contest(
         if all(one.pattern == "all" for one in held.causes):
             return held
         lin = at_minimum(field)
-        smooth, *_ = estimates(lin, held.n, (NEIGHBOURS,))
-        if sum(one.evidence for one in held.causes) > smooth.evidence + LEVEL:
+        smooth = estimates(lin, held.n, (NEIGHBOURS,))
+        if not smooth or sum(one.evidence for one in held.causes) > smooth[0].evidence + LEVEL:
             return held
         of_all = tuple(rival for rival in RIVALS if rival.patterns is common)
-        return _held(including(lin, smooth), worth, of_all)
+        return _held(including(lin, smooth[0]), worth, of_all)
     except np.linalg.LinAlgError:
         return None
 
