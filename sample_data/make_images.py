@@ -15,7 +15,9 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.files.images import encode_png
 from neurocal_cli.files.writing import write_whole
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.simulation.rendering import Background, Scene, Sensor, Target, render
+from neurocal_cli.simulation.rendering.layers import visible_midpoints
+from neurocal_cli.simulation.rendering.render import digitised, image_light
+from neurocal_cli.simulation.rendering.scene import Background, Scene, Target
 
 HERE = Path(__file__).resolve().parent
 CAMERA = Camera(Intrinsics(510.0, 508.0, 202.5, 147.0), image_size=(400, 300))
@@ -38,8 +40,8 @@ def poses(n: int) -> Iterator[Pose]:
 
 if __name__ == "__main__":
     for number, pose in enumerate(poses(6), start=1):
-        scene = Scene(CAMERA, pose, (BOARD,), Background(0.45), psf=0.7, sensor=Sensor(read_noise=NOISE))
-        rendered = render(scene, np.random.default_rng(number))
-        if not rendered.truth.planes[0].vertices_visible.all():
+        scene = Scene(CAMERA, pose, (BOARD,), Background(0.45), psf=0.7)
+        if len(visible_midpoints(scene)) < len(BOARD.plane.midpoint_ids()):
             raise SystemExit("a board leaves the image: choose another pose")
-        write_whole(str(HERE / f"board{number:02d}.png"), encode_png(rendered.image))
+        image = digitised(image_light(scene), np.random.default_rng(number), NOISE)
+        write_whole(str(HERE / f"board{number:02d}.png"), encode_png(image))

@@ -16,8 +16,11 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.marked_cells import to_print
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.simulation.rendering import Scene, Sides, Target, render
+from neurocal_cli.simulation.rendering.layers import visible_midpoints
+from neurocal_cli.simulation.rendering.render import digitised, image_light
+from neurocal_cli.simulation.rendering.scene import Scene, Sides, Target
 
 # The camera of Table 1, whose theta of 1.5708 is a rounded right angle.
 PAPER_CAMERA = Camera(Intrinsics(556.0, 549.0, 172.0, 121.0), image_size=(352, 240))
@@ -196,15 +199,10 @@ def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
     planes = scene.board.planes
     # With several planes, the pattern may extend to a fold, and paper beyond it would cross the fold.
     margin = Sides.all(_MARGIN if len(planes) == 1 else 0.0)
-    targets = tuple(Target(plane, margin=margin) for plane in planes)
+    targets = tuple(Target(to_print(plane), margin=margin) for plane in planes)
     for number, (name, pose) in enumerate(scene.poses.items()):
-        drawn = render(
-            Scene(scene.camera, pose, targets, unit=scene.unit), np.random.default_rng((seed, number))
-        )
-        seen = [np.array(one.midpoint_ids)[one.edges_visible] for one in drawn.truth.planes]
-        yield Picture(
-            name, drawn.image.astype(np.uint8, copy=False), frozenset(np.concatenate(seen).tolist())
-        )
+        shown, rng = Scene(scene.camera, pose, targets), np.random.default_rng((seed, number))
+        yield Picture(name, digitised(image_light(shown), rng), visible_midpoints(shown))
 
 
 def visible_points(scene: SimulatedScene, rendered: list[Picture]) -> Correspondences:

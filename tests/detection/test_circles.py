@@ -10,6 +10,7 @@ import pytest
 from support.marked import errors_of, marked_scene, plane_of, ringed, taken
 from support.occluders import Disc
 from support.picture_bound import edge_bound
+from support.pictures import Illumination, Rendered
 from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
@@ -20,7 +21,6 @@ from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.board_kinds import CirclePlane
-from neurocal_cli.simulation.rendering import Illumination, Rendered
 
 ASYMMETRIC = "asymmetric_circles:4x7:20:16"
 SYMMETRIC = "circles:5x4:20:12"

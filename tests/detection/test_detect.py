@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support.pictures import Rendered, render
 from support.rendered import Recipe, board_pose, condition, picture, single
 from support.seen_grids import labelled_vertices, seen_grid
 from support.slow_cases import slow_but
@@ -19,7 +20,6 @@ from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.simulation.rendering import Rendered, render
 
 BOARD = Board.single(9, 6, 28.0)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.occluders import Rectangle
 from support.picture_bound import scene_bound
+from support.pictures import PlaneTruth, ground_truth
 from support.real_data import RealFiles
 from support.rendered import condition, picture, rendered
 from support.slow_cases import slow_but
@@ -20,7 +21,6 @@ from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.links import find_links, find_seeds, lattice_from_links
 from neurocal_cli.detection.finding.overlaps import largest_second_difference, split_at_folds
 from neurocal_cli.detection.finding.saddles import Level, levels_of, refine_saddles
-from neurocal_cli.simulation.rendering import PlaneTruth, ground_truth
 
 cv2 = pytest.importorskip("cv2")
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from support.marked import errors_of, marked_scene, plane_of, taken, truth_of
 from support.picture_bound import scene_bound
+from support.pictures import Illumination, Scene
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
@@ -26,7 +27,6 @@ from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import TagPlane
 from neurocal_cli.observations.marked_cells import Print, marked_cells, printed_rectangles
 from neurocal_cli.observations.measured_directions import variance_across
-from neurocal_cli.simulation.rendering import Illumination, Scene
 
 CHARUCO = "charuco:6x5:40:30:DICT_4X4_50"
 APRIL = "aprilgrid:3x3:40:0.3"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from support.marked import errors_of as marked_errors
 from support.marked import marked_scene, plane_of, taken
 from support.measured import errors_of, take
+from support.pictures import Rendered, Scene
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
@@ -24,7 +25,6 @@ from neurocal_cli.detection.fitting.edge_profile import (
     find_sharpening,
 )
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.simulation.rendering import Rendered, Scene
 
 KINDS = ((1.0, 1.0), (2.0, 1.0), (5.0, 0.5), (1.0, 2.0), (0.6, 3.0))  # amount, radius [px]
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from support.marked import errors_of as errors_of_board
 from support.marked import marked_scene, plane_of, taken
 from support.measured import Points, errors_of
+from support.pictures import PlaneTruth, render
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.wide_boards import WideRecipe, in_circle, mixture, wide_picture
@@ -25,7 +26,6 @@ from neurocal_cli.detection.fitting.map_fit import WideMap, wide_start
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.wide_lens import WideLens, fit_wide_lens
 from neurocal_cli.observations.board import Board
-from neurocal_cli.simulation.rendering import PlaneTruth, render
 
 cv2 = pytest.importorskip("cv2")
 find_grids = pytest.importorskip("neurocal_cli.detection.finding.grids").find_grids

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 from support.picture_bound import edge_bound, noise_free, scene_bound, vertex_bound
+from support.pictures import Illumination, Scene, Sensor, digitised, ground_truth, image_light, render
 from support.rendered import CONDITIONS, RECIPES, condition, picture
 from support.slow_cases import slow_but
 
@@ -24,18 +25,9 @@ from neurocal_cli.camera.monotonic import monotonic_radius
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.simulation.rendering import (
-    Background,
-    Illumination,
-    Scene,
-    Sensor,
-    Sides,
-    Target,
-    ground_truth,
-    render,
-)
 from neurocal_cli.simulation.rendering.layers import half_plane
-from neurocal_cli.simulation.rendering.render import Blur, digitised, image_light
+from neurocal_cli.simulation.rendering.render import Blur
+from neurocal_cli.simulation.rendering.scene import Background, Sides, Target
 
 SMALL = Camera(Intrinsics(250.0, 252.0, 81.0, 58.0), image_size=(160, 120))
 PLANE = Plane("", 5, 4, 10.0)
@@ -439,6 +431,7 @@ def test_a_scene_that_cannot_be_is_refused(make: Any, message: str) -> None:
 
 def test_rendering_needs_neither_opencv_nor_scipy() -> None:
     code = (
-        "import sys, neurocal_cli.simulation.rendering; sys.exit(bool({'cv2', 'scipy'} & set(sys.modules)))"
+        "import sys, neurocal_cli.simulation.rendering.render\n"
+        "sys.exit(bool({'cv2', 'scipy'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -14,6 +14,7 @@ from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.other_methods.nonlinear import nonlinear
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.boards import named_board
 from neurocal_cli.commands.show.methods_report import (
     draw_rates,
     noise_json,
@@ -240,6 +241,21 @@ def test_pictures_show_the_points_where_the_truth_says() -> None:
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
     with pytest.raises(InputError, match="no board to render"):
         list(pictures(replace(scene, board=None)))
+
+
+def test_pictures_show_the_circles_where_the_truth_says() -> None:
+    from neurocal_cli import detect_points
+
+    board = named_board("circles:7x5:20")
+    scene = scene_of(PAPER_CAMERA, board, random_poses(PAPER_CAMERA, board, 1, np.random.default_rng(0)))
+    drawn = list(pictures(scene))
+    seen = visible_points(scene, drawn)
+    assert len(seen) == 35
+    found = detect_points(drawn[0].image, board)
+    place = {id_: k for k, id_ in enumerate(found.ids)}
+    assert seen.point is not None
+    off = found.pixels[[place[id_] for id_ in seen.point]] - seen.pixels
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.1
 
 
 def test_a_method_without_an_answer_is_counted() -> None:

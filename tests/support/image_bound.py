@@ -11,9 +11,9 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.simulation.rendering import Scene
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from support.picture_bound import noise_variance, shift_gradients
+from support.pictures import Scene
 
 _TO_RIM = 0.9  # squares beyond the outermost vertices; where the board ends is not part of its file
 _STEP = 1e-5

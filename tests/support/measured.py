@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import EDGE_H, VERTEX, Grid, Measured
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.simulation.rendering import PlaneTruth, Rendered, Scene, render
 from support.picture_bound import scene_bound
+from support.pictures import PlaneTruth, Rendered, Scene, render
 from support.rendered import condition
 
 Points = Literal["midpoints", "vertices"]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.simulation.rendering.layers import BoardLayer
-from neurocal_cli.simulation.rendering.render import enough_parts, image_light, response, signal
-from neurocal_cli.simulation.rendering.scene import Scene, Sensor
+from neurocal_cli.simulation.rendering.render import enough_parts
+from support.pictures import Scene, Sensor, image_light, response, signal
 from support.wide_camera import WideCamera
 
 _SRGB_LINEAR = 0.0031308

@@ -7,7 +7,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.identify import Identified
-from neurocal_cli.simulation.rendering import PlaneTruth, Rendered, Scene
+from support.pictures import PlaneTruth, Rendered, Scene
 
 
 def seen_grid(truth: PlaneTruth, first_black: bool, turn: int = 0) -> Grid:

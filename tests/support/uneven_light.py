@@ -11,11 +11,10 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.simulation.rendering import Scene, Sensor, ground_truth
-from neurocal_cli.simulation.rendering.render import Image, digitised, image_light
 from support.clutter import Clutter
 from support.measured import Points, found, places
 from support.occluders import Disc
+from support.pictures import Image, Scene, Sensor, digitised, ground_truth, image_light
 from support.rendered import Recipe, single
 
 # The board fills the image.

@@ -17,8 +17,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.observations.board import Plane
-from neurocal_cli.observations.board_kinds import CirclePlane
 from neurocal_cli.simulation.rendering.scene import Cover, Occluder, Scene, Target, half_plane
 
 # Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.
@@ -229,91 +227,28 @@ class Composition:
 Mask = NDArray[np.bool_]
 
 _TINY_CELL = 1e-6  # px; in place of a point
-_STEP = 1e-4  # squares; step of the differences that give directions in the image
 
 
-@frozen_dataclass(eq=False)
-class PlaneTruth:
-    """Points of a plane in the picture: its vertices, and the N mid-points of its edges.
+def visible_midpoints(scene: Scene) -> frozenset[str]:
+    """Ids of the mid-points whose edges nothing hides, by three times the blur including the pixel."""
+    shown: list[str] = []
+    for index, target in enumerate(scene.targets):
+        seen = edges_visible(Sight(scene, index, 3 * scene.sigma_t))
+        shown += np.array(target.plane.midpoint_ids())[seen].tolist()
+    return frozenset(shown)
 
-    The vertices of a grid of circles are their centres, and it has no edges.
+
+def edges_visible(sight: Sight) -> Mask:
+    """(N,) whether the ends, the quarter points and the middle of the edge of each mid-point are visible.
+
+    Of a grid of circles, whose points have no edges, whether their centres are.
     """
-
-    plane: Plane
-    vertices: Array  # (rows, cols, 2) [px] exact positions; NaN if the camera cannot project them
-    vertex_ids: tuple[str, ...]  # row by row
-    vertices_visible: Mask  # in front of the camera, in the image and not hidden, with a clearance
-    # (N, 2) [px] projections of the mid-points in space, in the order of `Plane.midpoint_grid`
-    midpoints: Array
-    midpoint_ids: tuple[str, ...]
-    midpoints_visible: Mask
-    edges_visible: Mask  # whether the mid-point, both ends and both quarter points are visible
-    ends: NDArray[np.intp]  # (N, 2) flat indices of the edge's ends among the vertices
-    normals: Array  # (N, 2) unit normals in the image, towards growing y_axis for `h`, x_axis for `v`
-    lengths: Array  # (N,) [px] distances between the ends of the edges
-    polarity: NDArray[np.int64]  # (N,) +1 if the square on the normal's side is white, -1 if it is black
-
-
-@frozen_dataclass(eq=False)
-class Truth:
-    """Ground truth of a picture, in the order of the scene's targets."""
-
-    planes: tuple[PlaneTruth, ...]
-
-
-def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
-    """Compute the exact positions of all points, and which of them are visible.
-
-    A point is visible if nothing hides its plane within the `clearance` [px]; by default three times the blur
-    including the pixel.
-    """
-    clearance = 3 * scene.sigma_t if clearance is None else clearance
-    sights = [_Sight(scene, k, clearance) for k in range(len(scene.targets))]
-    return Truth(tuple(map(_plane_truth, scene.targets, sights)))
-
-
-def _plane_truth(target: Target, sight: _Sight) -> PlaneTruth:
-    plane = target.plane
-    columns, rows = np.meshgrid(np.arange(plane.cols), np.arange(plane.rows))
-    vertex_grid = np.stack([columns, rows], axis=-1).astype(float)
-    circles = isinstance(plane, CirclePlane)
-    grid = np.zeros((0, 2)) if circles else plane.midpoint_grid()
+    grid = sight.plane.midpoint_grid()
     half = np.where(grid % 1 > 0, 0.5, 0.0)  # along the edge
-    vertices, vertices_visible = sight.look(vertex_grid)
-    midpoints, midpoints_visible = sight.look(grid)
-    quarters = [sight.look(grid + s * half)[1] for s in (-0.5, 0.5)]
-    first, second = (np.rint(grid + s * half).astype(np.intp) @ [1, plane.cols] for s in (-1, 1))
-    visible = vertices_visible.reshape(-1)
-    edges_visible = midpoints_visible & visible[first] & visible[second] & quarters[0] & quarters[1]
-    square = np.floor(grid + 0.5 * (1 - 2 * half)).astype(np.int64)  # on the side of the normal
-    chord = vertices.reshape(-1, 2)[second] - vertices.reshape(-1, 2)[first]
-    return PlaneTruth(
-        plane=plane,
-        vertices=vertices,
-        vertex_ids=plane.vertex_ids(),
-        vertices_visible=vertices_visible,
-        midpoints=midpoints,
-        midpoint_ids=() if circles else plane.midpoint_ids(),
-        midpoints_visible=midpoints_visible,
-        edges_visible=edges_visible,
-        ends=np.stack([first, second], axis=-1),
-        normals=_normals(sight, grid, half),
-        lengths=np.hypot(*chord.T),
-        polarity=np.where((square.sum(axis=1) % 2 == 0) == target.first_black, -1, 1),
-    )
+    return np.logical_and.reduce([sight.look(grid + s * half)[1] for s in (-1.0, -0.5, 0.0, 0.5, 1.0)])
 
 
-def _normals(sight: _Sight, grid: Array, half: Array) -> Array:
-    """Normals of the projected edges, towards the growing other axis."""
-    along, across = _STEP * 2 * half, _STEP * (1 - 2 * half)
-    tangent = sight.project(grid + along)[0] - sight.project(grid - along)[0]
-    side = sight.project(grid + across)[0] - sight.project(grid - across)[0]
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-    normal /= np.hypot(*normal.T)[:, None]
-    return np.asarray(normal * np.sign((normal * side).sum(axis=1))[:, None])
-
-
-class _Sight:
+class Sight:
     """Lines of sight from a camera to the points of one target of its scene."""
 
     def __init__(self, scene: Scene, index: int, clearance: float) -> None:

@@ -1,6 +1,6 @@
-"""Render pictures of chessboards with known truth: light, then the sensor's response, noise and rounding.
+"""Render pictures of boards: light, then noise and rounding.
 
-The light at each pixel comes from layers, illumination, blur and vignetting. The point spread function is a
+The light at each pixel comes from layers, illumination and blur. The point spread function is a
 Gaussian convolved with the pixel's box, integrated exactly. Most pixels are uniform, or linear under a
 gradient of light; they are convolved as a whole. Pixels with edges are divided into cells. Their means are
 convolved with the rest, and the differences of the cells from the mean are added pixel by pixel.
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.simulation.rendering.layers import Composition, Truth, ground_truth
-from neurocal_cli.simulation.rendering.scene import Illumination, Scene, Sensor
+from neurocal_cli.simulation.rendering.layers import Composition
+from neurocal_cli.simulation.rendering.scene import Illumination, Scene
 
 _TAIL = 5.7  # standard deviations at which the Gaussian is cut off; 1e-8 of the light is beyond
 _ROWS_AT_ONCE = 16  # rows processed at a time
@@ -27,26 +27,10 @@ _PARTS_BY_BLUR = 8.0
 _FEWEST_PARTS, _MOST_PARTS = 4, 24
 _STRIP = 32768  # pixels processed at a time; they fit into the cache
 _CHUNK = 65536  # cells processed at a time
-_SRGB_LINEAR = 0.0031308
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
-
-
-@frozen_dataclass(eq=False)
-class Rendered:
-    """A rendered picture."""
-
-    image: Image  # [DN]
-    truth: Truth
-
-
-def render(scene: Scene, rng: np.random.Generator) -> Rendered:
-    """Render a picture of a scene; only the noise comes from the generator."""
-    return Rendered(digitised(scene.sensor, image_light(scene), rng), ground_truth(scene))
 
 
 def image_light(scene: Scene, parts: int | None = None) -> Array:
-    """Render the light (height, width) at each pixel; 1 is the sensor's full scale at gain 1.
+    """Render the light (height, width) at each pixel; 1 is the sensor's full scale.
 
     Pixels with edges have `parts` cells along a side; the error falls with their square. By default it is
     below 0.0005 of the contrast (0.0001 px for an edge).
@@ -64,8 +48,7 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
         _fill(scene, composition, blur, rows, level, edged, residual)
     image = blur.convolve(*_shaded(scene, level, edged, pad))
     image += residual[2 * pad : height + 2 * pad, 2 * pad : width + 2 * pad]
-    image = image * _vignetting(scene)
-    return image if scene.circle is None else scene.circle(image)
+    return image
 
 
 def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) -> Array:
@@ -133,39 +116,10 @@ def _shaded(
     return np.where(edged, level, level * shade), slope_u, slope_v
 
 
-def _vignetting(scene: Scene) -> Array | float:
-    strength = scene.illumination.vignetting
-    if strength == 0:
-        return 1.0
-    width, height = scene.size
-    u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
-    corner = max(0.25 * ((width - 1) ** 2 + (height - 1) ** 2), 1.0)
-    return np.asarray(1 - strength * (u**2 + v[:, None] ** 2) / corner)
-
-
-def signal(sensor: Sensor, light: Array) -> Array:
-    """Linear signal of light; 1 is full scale."""
-    return sensor.gain * light + sensor.offset
-
-
-def response(sensor: Sensor, linear: Array) -> Array:
-    """Response curve of a linear signal, from [0, 1] to [0, 1]; light beyond full scale is clipped."""
-    x = np.clip(linear, 0.0, 1.0)
-    if sensor.response == "srgb":
-        return np.where(x <= _SRGB_LINEAR, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.asarray(x ** (1 / float(sensor.response))) if sensor.response != 1 else x
-
-
-def digitised(sensor: Sensor, light: Array, rng: np.random.Generator) -> Image:
-    """Convert light (H, W) to pixel values with noise."""
-    linear = signal(sensor, light)
-    if sensor.full_well is not None:
-        linear = rng.poisson(np.clip(linear, 0, None) * sensor.full_well) / sensor.full_well
-    values = response(sensor, linear) * sensor.white_dn
-    if sensor.read_noise > 0:
-        values = values + rng.normal(0.0, sensor.read_noise * sensor.white_dn / 255, values.shape)
-    whole = np.clip(np.rint(values), 0, sensor.white_dn)
-    return whole.astype(np.uint8) if sensor.bits == 8 else whole.astype(np.uint16)
+def digitised(light: Array, rng: np.random.Generator, noise: float = 2.0) -> NDArray[np.uint8]:
+    """Grey values of light (H, W), with Gaussian noise of a standard deviation [grey values]."""
+    values = 255 * np.clip(light, 0.0, 1.0) + rng.normal(0.0, noise, light.shape)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 @frozen_dataclass

@@ -1,15 +1,14 @@
-"""Scenes for rendering: camera, chessboards, what is printed on the boards, light, occluders and sensor.
+"""Scenes for rendering: camera, boards, what is printed on them, light and occluders.
 
-Radiances are linear, and 1 is the sensor's full scale at gain 1. Image coordinates follow the package's
+Radiances are linear, and 1 is the sensor's full scale. Image coordinates follow the package's
 convention: the centre of the top-left pixel is (0, 0).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import field
 from functools import cached_property
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, circle_places
 from neurocal_cli.observations.marked_cells import printed_rectangles
 
@@ -250,13 +249,11 @@ class Background:
 class Illumination:
     """Illumination of the scene, ``level (1 + gradient . ((u - uc) / W, (v - vc) / H))``.
 
-    It multiplies the radiance before the blur; vignetting multiplies the blurred image by
-    ``1 - vignetting rho^2``, rho = 1 in the image's corners.
+    It multiplies the radiance before the blur.
     """
 
     level: float = 1.0
     gradient: tuple[float, float] = (0.0, 0.0)
-    vignetting: float = 0.0
 
     def __post_init__(self) -> None:
         if self.level <= 0 or abs(self.gradient[0]) + abs(self.gradient[1]) >= 2:
@@ -264,33 +261,8 @@ class Illumination:
 
 
 @frozen_dataclass
-class Sensor:
-    """Model of the sensor: signal = gain radiance + offset, and image = signal^(1 / response)."""
-
-    response: float | Literal["srgb"] = 1.0  # 1 is linear
-    gain: float = 1.0
-    offset: float = 0.0
-    read_noise: float = 2.0  # [DN of 8 bits, 1/255 of full scale] standard deviation, after the response
-    full_well: float | None = None  # electrons at full scale; if given, the signal has Poisson noise
-    bits: Literal[8, 16] = 8
-
-    def __post_init__(self) -> None:
-        if self.bits not in (8, 16):
-            raise InputError(f"bits must be 8 or 16, found {self.bits}")
-        if self.response != "srgb" and not float(self.response) > 0:
-            raise InputError("response must be positive or 'srgb'")
-        if self.read_noise < 0 or (self.full_well is not None and self.full_well <= 0):
-            raise InputError("noise must not be negative, full_well must be positive")
-
-    @property
-    def white_dn(self) -> int:
-        """Largest value of a pixel."""
-        return (1 << self.bits) - 1
-
-
-@frozen_dataclass
 class Scene:
-    """Everything that determines a picture except its noise."""
+    """Everything that determines the light of a picture."""
 
     camera: Camera  # with the image size; other classes need only `rays`, `project` and `sees`
     pose: Pose  # world to camera
@@ -299,9 +271,6 @@ class Scene:
     occluders: tuple[Occluder, ...] = ()  # the first is in front
     illumination: Illumination = field(default_factory=Illumination)
     psf: float = 0.8  # [px] standard deviation of the Gaussian blur, without the pixel's box
-    sensor: Sensor = field(default_factory=Sensor)
-    unit: str = "mm"  # of the world coordinates
-    circle: Callable[[Array], Array] | None = None  # applies the image circle of a fisheye to the light
 
     def __post_init__(self) -> None:
         if not 0 <= self.psf <= 50:
@@ -314,11 +283,6 @@ class Scene:
         """(width, height) of the picture [px]."""
         assert self.camera.image_size is not None  # since __post_init__
         return self.camera.image_size
-
-    @property
-    def board(self) -> Board:
-        """Board made of the targets' planes."""
-        return Board(tuple(target.plane for target in self.targets), self.unit)
 
     @property
     def sigma_t(self) -> float:
