@@ -253,14 +253,14 @@ class Search:
         noise: float | None = None
         last = 0.0
         n_views = [problem.views.n_views for problem, _ in self.fits]
-        one_fold, folds = [np.zeros(n, dtype=np.intp) for n in n_views], folds_of(n_views)
+        folds = folds_of(n_views)
         for step in range(_STEPS):
             # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
             if self.still:
                 here = self._of_held_points()
             else:
-                folded = folded_information(self.sights(), len(self.given), folds if known else one_fold)
+                folded = folded_information(self.sights(), len(self.given), folds if known else None)
                 here = folded.whole.turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
             if self.surface is not None:

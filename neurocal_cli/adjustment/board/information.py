@@ -21,50 +21,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import Arrowhead
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, derivatives, free_columns, put_displaced
-from neurocal_cli.adjustment.views import PointBatches, Views, batches_of, products
+from neurocal_cli.adjustment.views import Views, batches_of, products
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.target import N_SHAPES
-
-
-def linearised(
-    batches: PointBatches, state: CameraState, scale: Array, label: NDArray[np.intp], shapes: Array | None
-) -> Iterator[tuple[slice, Array, Array]]:
-    """Chunks of batches, their rows of derivatives and residuals, and the derivatives by the points.
-
-    `scale` (V,) is S2 of each view, and `label` (T, n) is the index of the target point in each slot, or a
-    single row that holds for all batches. With bends (`shapes`), the rows have the derivatives by each view's
-    bend. They are overwritten in the next chunk.
-    """
-    width, more = 12 + len(state.k), 0 if shapes is None else N_SHAPES
-    buffer = batches.memory(width + more, state.square)
-    for chunk in batches.chunks():
-        view = batches.view[chunk]
-        part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part[:, :width])
-        # d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
-        turn = np.swapaxes(state.R[view] / scale[view][:, None, None], 1, 2)
-        by_tau = part[:, POSE.start + 3 : POSE.stop]
-        by_point = (turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape)  # (T, 3, 2, n)
-        if shapes is not None:
-            of_points = shapes[label if len(label) == 1 else label[chunk]]  # (T, n, 3, 3) or (1, n, 3, 3)
-            along = np.moveaxis(of_points, 1, 3)
-            part[:, -2] = part[:, width - 1]
-            put_displaced(by_point, np.ascontiguousarray(along), part[:, width - 1 : -2])
-        yield chunk, part, by_point
-
-
-def blocks_by_batch(batches: PointBatches, state: CameraState, shapes: Array | None) -> Array:
-    """Memory for the normal matrices of all batches."""
-    whole = 12 + len(state.k) + (0 if shapes is None else N_SHAPES)
-    return np.empty((len(batches.view), whole, whole))
-
-
-def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
-    """Columns of a view's own unknowns in normal matrices of this width: omega, tau, and bends if any."""
-    last = np.arange(width - 1 - N_SHAPES, width - 1) if bends else np.arange(0)
-    return np.concatenate([POSE_COLUMNS, last])
 
 
 @frozen_dataclass(eq=False)
@@ -89,23 +50,57 @@ class Sight:
         """Columns (f,) of the camera's free parameters in normal matrices."""
         return free_columns(self.free)
 
+    @property
+    def own_columns(self) -> NDArray[np.intp]:
+        """Columns (p,) of a view's own unknowns in normal matrices: omega, tau, and bends if any."""
+        more = 0 if self.shapes is None else N_SHAPES
+        return np.concatenate([POSE_COLUMNS, 11 + len(self.state.k) + np.arange(more)])
+
     @cached_property
     def slots(self) -> NDArray[np.intp]:
         """(T, n) index of the target point in each slot of the batches; -1 for padding."""
-        return labelled(self.views, self.label)
-
-    def of_views(self, which: NDArray[np.intp]) -> Sight:
-        """The observations of some views."""
-        return self._of(which, self.views.subset(which), np.isin(self.views.index, which))
+        views, numbers = self.views, np.column_stack([self.label, self.label]).astype(float)
+        laid = batches_of(views.local, numbers, None, views.index, views.n_views)
+        found = np.rint(laid.pixels[:, 0]).astype(np.intp)
+        if laid.whitening is not None:
+            found[laid.whitening[:, 0] == 0] = -1
+        return found
 
     def of_points(self, kept: NDArray[np.bool_]) -> Sight:
         """The observations of some points (N,), in the order of `views`."""
-        return self._of(np.unique(self.views.index[kept]), self.views.of_points(kept), kept)
-
-    def _of(self, which: NDArray[np.intp], views: Views, kept: NDArray[np.bool_]) -> Sight:
-        state = self.state.of_views(which)
+        which = np.unique(self.views.index[kept])
+        views, state = self.views.of_points(kept), self.state.of_views(which)
         bends = None if self.bends is None else self.bends[which]
         return replace(self, views=views, state=state, label=self.label[kept], bends=bends)
+
+    def memory(self) -> Array:
+        """Memory for the normal matrices of all batches."""
+        width = 6 + len(self.state.k) + len(self.own_columns)
+        return np.empty((len(self.views.batches.view), width, width))
+
+    def linearised(self, label: NDArray[np.intp]) -> Iterator[tuple[slice, Array, Array]]:
+        """Chunks of batches, their rows of derivatives and residuals, and the derivatives by the points.
+
+        `label` are the `slots`, or a single row of them that holds for all batches. With bends, the rows have
+        the derivatives by each view's bend. They are overwritten in the next chunk.
+        """
+        batches, state, shapes = self.views.batches, self.state, self.shapes
+        width = 12 + len(state.k)
+        buffer = batches.memory(6 + len(state.k) + len(self.own_columns), state.square)
+        for chunk in batches.chunks():
+            view = batches.view[chunk]
+            part = buffer[: len(view)]
+            derivatives(batches, chunk, state, part[:, :width])
+            # d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
+            turn = np.swapaxes(state.R[view] / self.views.scale[view][:, None, None], 1, 2)
+            by_tau = part[:, POSE.start + 3 : POSE.stop]
+            by_point = (turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape)  # (T, 3, 2, n)
+            if shapes is not None:
+                of_points = shapes[label if len(label) == 1 else label[chunk]]  # (T, n, 3, 3) or (1, n, 3, 3)
+                along = np.moveaxis(of_points, 1, 3)
+                part[:, -2] = part[:, width - 1]
+                put_displaced(by_point, np.ascontiguousarray(along), part[:, width - 1 : -2])
+            yield chunk, part, by_point
 
 
 @frozen_dataclass(eq=False)
@@ -205,19 +200,19 @@ class FoldedInformation:
 
 def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     """Sum over the observations of all cameras; each camera has its own free parameters and poses."""
-    one_fold = [np.zeros(sight.views.n_views, dtype=np.intp) for sight in sights]
-    return folded_information(sights, n_points, one_fold).whole
+    return folded_information(sights, n_points).whole
 
 
 def folded_information(
-    sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]]
+    sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]] | None = None
 ) -> FoldedInformation:
     """The same, and the sums over each fold; `folds` (V,) are the folds of each camera's views, from 0."""
+    folds = folds or [np.zeros(sight.views.n_views, dtype=np.intp) for sight in sights]
     n_folds = 1 + max(int(fold.max()) for fold in folds)
     widths = [int(sight.free.sum()) for sight in sights]
     poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
     f, P = sum(widths), sum(poses)
-    p = 6 if sights[0].shapes is None else 6 + N_SHAPES
+    p = len(sights[0].own_columns)
     found = Information(  # the sums have one more axis, for the folds
         Arrowhead(np.zeros((n_folds, f + 1, f + 1)), np.zeros((P, p, p)), np.zeros((P, p, f + 1))),
         np.zeros((n_folds, n_points, 3, 3)), np.zeros((n_folds, n_points, 3, f + 1)),
@@ -279,71 +274,44 @@ def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> None:
     """Add the observations of one camera to the sums of the folds (V,) of its views."""
-    views, columns, (n_folds, n_points) = sight.views, sight.columns, found.point.shape[:2]
-    # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
-    cross = found.pose_point[poses] if sight.free_poses else None
-    terms = folded_terms(
-        views.batches, sight.state, views.scale, sight.slots, columns, n_points, fold, n_folds, sight.shapes,
-        cross,
+    views, columns, of_pose, (n_folds, n_points) = (
+        sight.views, sight.columns, sight.own_columns, found.point.shape[:2],
     )  # fmt: skip
-    normal, px2 = terms.normal, views.pixel_scale**2
+    # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
+    cross = (
+        found.pose_point[poses] if sight.free_poses else np.zeros((views.n_views, len(of_pose), n_points, 3))
+    )
+    normal, summed = _terms(sight, cross, fold, n_folds)
+    px2 = views.pixel_scale**2
     by_fold = px2 * np.stack([normal[fold == k].sum(axis=0) for k in range(n_folds)])
     kept, place = np.append(columns, normal.shape[1] - 1), np.append(np.arange(own.start, own.stop), -1)
     found.cameras.shared[:, place[:, None], place] += by_fold[:, kept[:, None], kept]
-    found.point[...] += px2 * terms.point
-    found.by_camera[..., own] += px2 * terms.by_camera[..., :-1]  # slices are faster than indices
-    found.by_camera[..., -1] += px2 * terms.by_camera[..., -1]
+    found.point[...] += px2 * summed[..., :3]
+    found.by_camera[..., own] += px2 * summed[..., 3:-1]  # slices are faster than indices
+    found.by_camera[..., -1] += px2 * summed[..., -1]
     if sight.free_poses:
-        of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
         found.cameras.own[poses] = px2 * normal[:, of_pose[:, None], of_pose]
         found.cameras.cross[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
         found.cameras.cross[poses, :, -1] = px2 * normal[:, of_pose, -1]
-        found.pose_point[poses] *= px2
+        cross *= px2
 
 
-@frozen_dataclass(eq=False)
-class PointTerms:
-    """Sums of products with the derivatives by the target points, for one camera, normalised.
+def _terms(sight: Sight, cross: Array, fold: NDArray[np.intp], n_folds: int) -> tuple[Array, Array]:
+    """Normal matrices (V, w, w) of one camera's views, and sums by fold and point (F, n, 3, f + 4).
 
-    `normal` (V, 12 + K, 12 + K) is as from `normal_blocks`; with bends, it has three columns for them before
-    the residual. The rest is as in `Information`; sums over views have one more axis, for the folds.
+    The sums are products of the derivatives by the points with these, those by the camera's free parameters
+    and the residuals, all normalised. `cross` (V, p, n, 3) are zeros that become those with the views' own
+    unknowns.
     """
-
-    normal: Array
-    point: Array
-    by_camera: Array
-    pose_point: Array
-
-
-def folded_terms(
-    batches: PointBatches,
-    state: CameraState,
-    scale: Array,
-    label: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    n_points: int,
-    fold: NDArray[np.intp],
-    n_folds: int,
-    shapes: Array | None = None,
-    out: Array | None = None,
-) -> PointTerms:
-    """Sums of one camera over its observations of `n_points` target points, for each fold (V,) of its views.
-
-    `scale` (V,) is S2 of each view, `label` (T, n) is from `labelled`, and `columns` (f,) are those of the
-    camera's free parameters; `shapes` is as in `Sight`. `out` (V, p, n, 3) are zeros that become those of
-    poses and points.
-    """
-    f, V, by_batch = len(columns), batches.n_views, blocks_by_batch(batches, state, shapes)
-    whole = by_batch.shape[1]
-    of_pose = pose_columns(whole, shapes is not None)
-    p, kept = len(of_pose), np.append(columns, whole - 1)
+    batches, label, n_points = sight.views.batches, sight.slots, cross.shape[2]
+    of_pose, by_batch = sight.own_columns, sight.memory()
+    kept = np.append(sight.columns, by_batch.shape[1] - 1)
     ordered = np.sort(label, axis=1)
     twice = (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)
-    once = len(label) == V and not twice.any()  # each view is one batch, in which no point is twice
+    once = len(label) == len(cross) and not twice.any()  # each view is one batch, in which no point is twice
     alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
-    summed = np.zeros((n_folds, n_points, 3, f + 4))
-    cross = np.zeros((V, p, n_points, 3)) if out is None else out
-    for chunk, part, by_point in linearised(batches, state, scale, label[:1] if alike else label, shapes):
+    summed = np.zeros((n_folds, n_points, 3, len(kept) + 3))
+    for chunk, part, by_point in sight.linearised(label[:1] if alike else label):
         view, seen = batches.view[chunk], label[chunk]
         products(part, by_batch[chunk])
         rows = np.concatenate([by_point, part[:, kept]], axis=1)
@@ -353,7 +321,9 @@ def folded_terms(
             n = len(own)
             for k in range(n_folds):
                 of = fold[view] == k if n_folds > 1 else slice(None)
-                summed[k, seen[0]] += own[:, :, of].reshape(n, 3, -1) @ rows[:, of].reshape(n, -1, f + 4)
+                summed[k, seen[0]] += own[:, :, of].reshape(n, 3, -1) @ rows[:, of].reshape(
+                    n, -1, len(kept) + 3
+                )
             cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
             continue
         real = seen >= 0
@@ -366,7 +336,7 @@ def folded_terms(
             np.swapaxes(cross, 1, 2)[places] = each
         else:
             np.add.at(np.swapaxes(cross, 1, 2), places, each)
-    return PointTerms(batches.sum_by_view(by_batch), summed[..., :3], summed[..., 3:], cross)
+    return batches.sum_by_view(by_batch), summed
 
 
 def _of_each(a: Array, b: Array) -> Array:
@@ -378,29 +348,15 @@ def _of_each(a: Array, b: Array) -> Array:
 
 def without_points(sight: Sight) -> Array:
     """(V, w, w) normal matrices of one camera's views [px], for given target points."""
-    views, state = sight.views, sight.state
-    by_batch = blocks_by_batch(views.batches, state, sight.shapes)
-    for chunk, part, _ in linearised(views.batches, state, views.scale, sight.slots, sight.shapes):
+    batches, by_batch = sight.views.batches, sight.memory()
+    for chunk, part, _ in sight.linearised(sight.slots):
         products(part, by_batch[chunk])
-    return views.pixel_scale**2 * views.batches.sum_by_view(by_batch)
-
-
-def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(T, n) index of the target point in each slot of the batches, from those (N,) of the views' points.
-
-    It is -1 for padding.
-    """
-    numbers = np.column_stack([label, label]).astype(float)
-    laid = batches_of(views.local, numbers, None, views.index, views.n_views)
-    found = np.rint(laid.pixels[:, 0]).astype(np.intp)
-    if laid.whitening is not None:
-        found[laid.whitening[:, 0] == 0] = -1
-    return found
+    return sight.views.pixel_scale**2 * batches.sum_by_view(by_batch)
 
 
 def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
     """Information of some views (V,) of one camera, from `without_points`, with fixed target points."""
-    of_pose, P = pose_columns(normal.shape[1], sight.shapes is not None), which.sum() * sight.free_poses
+    of_pose, P = sight.own_columns, which.sum() * sight.free_poses
     arrow = Arrowhead.of(normal[which], sight.columns, of_pose)
     found = Information(
         replace(arrow, own=arrow.own[:P], cross=arrow.cross[:P]),

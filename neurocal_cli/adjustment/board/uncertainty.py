@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    blocks_by_batch,
     folded_information,
     information_of,
     joined_without_each,
-    linearised,
 )
 from neurocal_cli.adjustment.board.posterior import Posterior, camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
@@ -111,8 +109,8 @@ def _efficient(sight: Sight, followed: Array) -> Array:
     """
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for padding, labelled -1
     batches, columns, label = sight.views.batches, sight.columns, sight.slots
-    by_batch = blocks_by_batch(batches, sight.state, sight.shapes)
-    for chunk, part, by_point in linearised(batches, sight.state, sight.views.scale, label, sight.shapes):
+    by_batch = sight.memory()
+    for chunk, part, by_point in sight.linearised(label):
         J = part.copy()
         J[:, columns] -= np.einsum("ftni,ticn->tfcn", followed[:, label[chunk]], by_point)
         products(J, by_batch[chunk])

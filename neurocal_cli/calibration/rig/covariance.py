@@ -26,7 +26,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.information import Information, folded_terms, labelled
+from neurocal_cli.adjustment.board.information import Information, Sight, information_of
 from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import Prior, prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
@@ -41,7 +41,7 @@ from neurocal_cli.adjustment.open_choices import (
     stretches,
     with_stretch,
 )
-from neurocal_cli.adjustment.reprojection import camera_columns, stretched_blocks
+from neurocal_cli.adjustment.reprojection import stretched_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.target import Target
@@ -123,16 +123,14 @@ def information_of_rig(target: Target, fit: RigFit) -> tuple[Information, Prior]
     point, by_shared = np.zeros((n, 3, 3)), np.zeros((n, 3, columns.n_shared + 1))
     pose_point = np.zeros((len(problem.scale), 6, n, 3))
     for side, (observed, own) in enumerate(zip(problem.observations, columns.cameras, strict=True)):
-        views = observed.views
-        label = labelled(views, target.rows_of(views.world))
-        camera, shared_columns = problem.camera(state, side), camera_columns(len(own) - 5)
-        one_fold = np.zeros(views.n_views, dtype=np.intp)
-        terms = folded_terms(views.batches, camera, views.scale, label, shared_columns, n, one_fold, 1)
-        w, (of_rig, by_rig, by_pose) = observed.weight, problem.pose_steps(state, side)
-        point += w * terms.point[0]
-        by_shared[:, :, np.append(own, -1)] += w * terms.by_camera[0]
-        by_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", terms.pose_point, by_rig)
-        pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, by_pose)
+        views, label = observed.views, target.rows_of(observed.views.world)
+        sight = Sight(views, problem.camera(state, side), np.ones(len(own), dtype=bool), True, label)
+        seen, w = information_of([sight], n), observed.weight / views.pixel_scale**2
+        of_rig, by_rig, by_pose = problem.pose_steps(state, side)
+        point += w * seen.point
+        by_shared[:, :, np.append(own, -1)] += w * seen.by_camera
+        by_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", seen.pose_point, by_rig)
+        pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", seen.pose_point, by_pose)
     equations = sum(observed.views.n_equations for observed in problem.observations)
     by_shared = by_shared[:, :, np.append(shared, -1)]
     info = Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
