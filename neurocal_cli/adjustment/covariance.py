@@ -62,7 +62,7 @@ _TOLD_APART = 2.0  # standard deviations from which on a coefficient differs sig
 
 @frozen_dataclass(eq=False)
 class CovarianceBasis:
-    """Input of a camera's covariance (`covariance`, `counting_views`)."""
+    """Input of a camera's covariance (`Minimum.covariance`, `counting_views`)."""
 
     minimum: Minimum
     # (f, f) covariance of A's free entries and the free distortion coefficients, normalised, if it does not
@@ -75,15 +75,6 @@ class CovarianceBasis:
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
     # (V, 6, 6) covariance of the poses, if it does not follow from the normal matrices.
     poses: Array | None = None
-
-
-def covariance(m: Minimum, n_equations: float, shared: Array | None = None) -> Covariance:
-    """Invert the normal matrices of a calibration, with the variance of the residuals of so many equations.
-
-    If the covariance `shared` (f, f) of the free entries and coefficients comes from elsewhere, the poses
-    follow it.
-    """
-    return m.arrow.covariance(m.variance(n_equations), shared)
 
 
 def entry_covariance(
@@ -205,7 +196,7 @@ def counting_views(
 ) -> Covariance:
     """Covariances for residuals that are independent between views only.
 
-    The result is `found`, the `covariance` from the normal matrix, if the views, of which it is known which
+    The result is `found`, the covariance from the normal matrix, if the views, of which it is known which
     repeat a pose, contradict each other no more than the residuals explain. `moves_without` takes the pose
     number of each view and returns the moves of the free parameters when the views of each pose are left out;
     it is needed if they do not follow from the normal matrices. An estimated target may absorb contradictions

@@ -24,7 +24,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import Arrowhead, eliminate, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import Arrowhead, Covariance, eliminate, unit_diagonal
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, folds_of
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, free_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views, batches_of
@@ -210,6 +210,10 @@ class Minimum:
         """Variance of the residuals of so many equations: two for most points; see `measured_directions`."""
         unknowns = int(self.free.sum()) + (6 * len(self.normal) if self.free_poses else 0)
         return float(self.normal[:, -1, -1].sum()) / max(n_equations - unknowns, 1)
+
+    def covariance(self, n_equations: float, shared: Array | None = None) -> Covariance:
+        """From the normal matrices; for so many equations, and for `shared`, see there and `Arrowhead`."""
+        return self.arrow.covariance(self.variance(n_equations), shared)
 
 
 @quietly

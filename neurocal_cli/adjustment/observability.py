@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,31 +48,29 @@ def check_points(problem: Problem) -> None:
 
 
 def _check_each_view(views: Views) -> None:
-    for reason, bad in _faults_of_views(views):
-        if bad.any():
-            which = int(np.argmax(bad))
-            many = f" (and {int(bad.sum()) - 1} more views)" if bad.sum() > 1 else ""
-            raise DegenerateGeometryError(f"view {views.names[which]!r}{many}: {reason}")
+    found = views_without_pose(views)
+    if found:
+        name, reason = next(iter(found.items()))
+        more = list(found.values()).count(reason) - 1
+        many = f" (and {more} more views)" if more else ""
+        raise DegenerateGeometryError(f"view {name!r}{many}: {reason}")
 
 
 def views_without_pose(views: Views) -> dict[str, str]:
     """The views whose points determine no pose, each with the reason."""
+    line = views.extent[:, 1] <= _COLLINEAR * views.extent[:, 0]
+    faults = {
+        "there is only one point; give at least 4 (6 for a solid target of type 1)": views.counts == 1,
+        "all points are the same world point; check the columns X,Y,Z": views.distinct < 2,
+        "all points lie on one line; give points that spread over a plane or in space": line,
+        "all pixels u,v lie on one line; check the columns": _on_one_line(views),
+        "fewer than 4 different points; give at least 4 (6 for a solid target of type 1)": views.distinct < 4,
+    }
     found: dict[str, str] = {}
-    for reason, bad in _faults_of_views(views):
+    for reason, bad in faults.items():
         for which in np.flatnonzero(bad).tolist():
             found.setdefault(views.names[which], reason)
     return found
-
-
-def _faults_of_views(views: Views) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Why views (V,) determine no pose."""
-    few = views.distinct < 4
-    line = views.extent[:, 1] <= _COLLINEAR * views.extent[:, 0]
-    yield "there is only one point; give at least 4 (6 for a solid target of type 1)", views.counts == 1
-    yield "all points are the same world point; check the columns X,Y,Z", views.distinct < 2
-    yield "all points lie on one line; give points that spread over a plane or in space", line
-    yield "all pixels u,v lie on one line; check the columns", _on_one_line(views)
-    yield "fewer than 4 different points; give at least 4 (6 for a solid target of type 1)", few
 
 
 def _on_one_line(views: Views) -> NDArray[np.bool_]:

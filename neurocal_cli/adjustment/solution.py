@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
@@ -125,7 +124,7 @@ class Solution:
     def covariance(self) -> Covariance:
         """Covariances from the normal matrices alone, for a target that is as given."""
         n = self.problem.views.n_equations + self.by_prior
-        return covariance(self.problem.minimum(self.adjusted), n, self.shared)
+        return self.problem.minimum(self.adjusted).covariance(n, self.shared)
 
     @cached_property
     def alike(self) -> float:

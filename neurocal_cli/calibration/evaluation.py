@@ -34,7 +34,7 @@ from neurocal_cli.calibration.verdict.findings import (
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, in_cameras
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
@@ -80,11 +80,6 @@ class CameraEvaluation:
     def fitted_views(self) -> tuple[str, ...]:
         """Names of the views whose pose was estimated here."""
         return tuple(name for name, view in self.views.items() if view.fitted)
-
-    @property
-    def given_points(self) -> GivenPoints:
-        """The measures for a verdict on these points."""
-        return GivenPoints(self.rmse_px, self.n_points, self.n_behind, self.fit)
 
 
 def evaluate_camera(
@@ -191,9 +186,7 @@ def other_images(calibration: Calibration, points: Correspondences) -> tuple[str
 
 def predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
     """Project all points with the poses of their views; also which points lie in front."""
-    R = np.stack([pose.R for pose in poses])[points.view_index]
-    t = np.stack([pose.t for pose in poses])[points.view_index]
-    return camera.project(np.einsum("nij,nj->ni", R, points.world) + t)
+    return camera.project(in_cameras(poses, points.world, points.view_index))
 
 
 def _measure(residuals: Array, points: Correspondences, fitted: NDArray[np.bool_]) -> CameraEvaluation:
@@ -226,25 +219,18 @@ def _measure(residuals: Array, points: Correspondences, fitted: NDArray[np.bool_
     )
 
 
-@frozen_dataclass
-class GivenPoints:
-    """The error of a calibration on given points."""
-
-    rmse_px: float  # px; nan if no point lies in front of the camera
-    n_points: int
-    n_behind: int
-    fit: Calibration | None = None  # the views whose poses were fitted to these points, with the camera given
-
-
 def judged_by_points(
-    verdict: Verdict, calibration: Calibration, given: GivenPoints, drift: Drift | None = None
+    verdict: Verdict, calibration: Calibration, given: CameraEvaluation, drift: Drift | None = None
 ) -> Verdict:
     """Add the findings about given points to the verdict of the calibration, which becomes no better.
 
     `drift` is that from the calibration to a camera calibrated from these points, if they determine one.
     """
-    findings = [given_error(verdict, calibration.rmse_px, calibration.points, given)]
-    return with_findings(verdict, [*findings, *given_camera(calibration, given.fit), *changed_camera(drift)])
+    seen = given.residuals[np.isfinite(given.residuals[:, 0])]
+    finding = given_error(
+        verdict, calibration.rmse_px, calibration.points, (seen**2).sum(axis=1), given.n_points
+    )
+    return with_findings(verdict, [finding, *given_camera(calibration, given.fit), *changed_camera(drift)])
 
 
 def changed_camera(drift: Drift | None) -> list[Finding]:
@@ -283,21 +269,23 @@ def given_error(
     verdict: Verdict,
     rmse_px: float,
     own_points: Correspondences,
-    given: GivenPoints,
+    squares: Array,
+    n_points: int,
     same: str = "camera at the same zoom and focus",
 ) -> Finding:
-    """The finding about the error on given points.
+    """The finding about the error on given points, of which those in front have these squared errors [px^2].
 
     The verdict, the reprojection error [px] and its own points are those of the calibration; `same` names
     what should not have changed, for the advice.
     """
-    error, seen = given.rmse_px, given.n_points - given.n_behind
-    if 2 * seen < given.n_points:
+    seen = len(squares)
+    if 2 * seen < n_points:
         return (
             2,
-            f"{given.n_behind} of the {given.n_points} given points lie behind the camera",
+            f"{n_points - seen} of the {n_points} given points lie behind the camera",
             "check the signs of X,Y,Z, and that the points are of these views",
         )
+    error = float(np.sqrt(squares.mean()))
     # With few points, the error of a calibration on its own points is too small, so use cross-validation.
     held_out = verdict.measures.get("held_out_px", np.nan)
     own = float(np.fmax(rmse_px, held_out))

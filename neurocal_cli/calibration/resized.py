@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -28,35 +29,20 @@ def resized(
     if isinstance(result, Calibration):
         views, second = (_views(views, changes[0]) for views in (result.views, result.second_poses))
         return replace(_resized(result, changes[0]), views=views, second_poses=second)
-    if isinstance(result, StereoRig):
-        return _resized_pair(result, changes)
-    pairs = zip(result.cameras.items(), changes, strict=True)
     mean = float(np.mean([change.mean for change in changes]))
-    return replace(
-        result.lean,
-        cameras={name: _resized(camera, change) for (name, camera), change in pairs},
-        rmse_px=mean * result.rmse_px,
-        max_px=mean * result.max_px,
-        judgement=None,
-    )
+    errors: dict[str, Any] = {name: mean * getattr(result, name) for name in ("rmse_px", "max_px")}
+    if isinstance(result, StereoRig):
+        left, right = map(_resized, (result.left, result.right), changes)
+        return replace(result.lean, left=left, right=right, judgement=None, **errors)
+    cameras = map(_resized, result.cameras.values(), changes)
+    by_name = dict(zip(result.cameras, cameras, strict=True))
+    return replace(result.lean, cameras=by_name, judgement=None, **errors)
 
 
 def _views(views: Mapping[str, ViewResult], change: Resizing) -> dict[str, ViewResult]:
     return {
         name: replace(view, n_points=0, rmse_px=change.mean * view.rmse_px) for name, view in views.items()
     }
-
-
-def _resized_pair(rig: StereoRig, changes: Sequence[Resizing]) -> StereoRig:
-    mean = float(np.mean([change.mean for change in changes]))
-    return replace(
-        rig.lean,
-        left=_resized(rig.left, changes[0]),
-        right=_resized(rig.right, changes[1]),
-        rmse_px=mean * rig.rmse_px,
-        max_px=mean * rig.max_px,
-        judgement=None,
-    )
 
 
 def _resized(cal: Calibration, change: Resizing) -> Calibration:

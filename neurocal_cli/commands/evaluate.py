@@ -183,7 +183,7 @@ def camera(
         drift = drift_since(own, evaluation.fit.points)
         since = [since_line(drift)]
     if own is not None and given is not None and verdict is not None:
-        verdict = judged_by_points(verdict, own, evaluation.given_points, drift)
+        verdict = judged_by_points(verdict, own, evaluation, drift)
     renamed = evaluation.renamed
     for names, why in (
         ([name for name in evaluation.fitted_views if name not in renamed], "not in the calibration"),

@@ -16,7 +16,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import covariance, parameter_covariance, pose_std
+from neurocal_cli.adjustment.covariance import parameter_covariance, pose_std
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.problem import normalised, problem_for
 from neurocal_cli.adjustment.reprojection import normal_blocks
@@ -267,7 +267,7 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     normal[:, -1, -1] = 0.0
     normal[0, -1, -1] = spare / views.pixel_scale**2
     free = problem.free_camera
-    cov = covariance(Minimum(views, state, normal, free, True), views.n_equations)
+    cov = Minimum(views, state, normal, free, True).covariance(views.n_equations)
     entries = np.zeros((len(free),) * 2)
     entries[np.ix_(free, free)] = cov.shared
     _, std = parameter_covariance(camera.intrinsics, camera.model, entries, views.pixel_scale, problem.fixed)

@@ -12,7 +12,6 @@ from support.scenes import pinhole, random_flat_set, random_solid
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.views import arrange
@@ -132,7 +131,7 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
         whole[mine, : len(f)] = normal[k][f, 5:11].T
     variance = normal[:, 11, 11].sum() / (2 * len(scene.view) - len(whole))
     expected = variance * np.linalg.inv(whole)
-    found = covariance(Minimum(views, state, normal, np.array(free, bool), poses), 2 * len(scene.view))
+    found = Minimum(views, state, normal, np.array(free, bool), poses).covariance(2 * len(scene.view))
     np.testing.assert_allclose(found.shared, expected[: len(f), : len(f)], rtol=1e-8)
     assert found.own.shape == (5, 6 * poses, 6 * poses)
     for k in range(5 * poses):
@@ -148,12 +147,12 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
     state = scene.true_state(views)
     normal, _ = normal_blocks(views.batches, state)
     normal[1, 5:11] = normal[1, :, 5:11] = 0.0  # a pose that nothing depends on
-    assert covariance(Minimum(views, state, normal, np.ones(5, bool), True), 180).smallest == 0
+    assert Minimum(views, state, normal, np.ones(5, bool), True).covariance(180).smallest == 0
     # Without the third view's tilt the focal length and the distance are one unknown.
     state = scene.true_state(views)
     flat = CameraState(state.entries, np.tile(np.eye(3), (3, 1, 1)), np.tile([0.0, 0.0, 5.0], (3, 1)))
     normal, _ = normal_blocks(views.batches, flat)
-    assert covariance(Minimum(views, state, normal, np.ones(5, bool), True), 180).smallest < 1e-13
+    assert Minimum(views, state, normal, np.ones(5, bool), True).covariance(180).smallest < 1e-13
 
 
 @pytest.mark.parametrize(

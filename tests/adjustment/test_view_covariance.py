@@ -13,7 +13,7 @@ from neurocal_cli import Calibration, calibrate
 from neurocal_cli.adjustment import covariance as covariance_module
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.chi_squared import chi_squared, exceeded_by_chance
-from neurocal_cli.adjustment.covariance import counting_views, covariance
+from neurocal_cli.adjustment.covariance import counting_views
 from neurocal_cli.adjustment.cross_validation import Minimum, Quadratics
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.views import Views, arrange
@@ -44,7 +44,7 @@ def scores(n_views: int, seeds: range) -> list[bool]:
         views = arrange(scene.points(0.2, rng))
         found = adjust(views.batches, scene.true_state(views), NO_SKEW, True)
         m = Minimum(views, found.state, found.normal, NO_SKEW, True, own_poses(n_views))
-        cov = covariance(m, views.n_equations)
+        cov = m.covariance(views.n_equations)
         taken.append(counting_views(cov, m, views.n_equations) is not cov)
     return taken
 
@@ -92,7 +92,7 @@ def test_errors_of_clean_views_are_as_the_std_say(n_views: int) -> None:
 
 def noise_std(views: Views, found: Calibration) -> float:
     """Std of alpha_u from the normal matrix alone."""
-    entries = covariance(_AtMinimum(found).minimum, views.n_equations).shared
+    entries = _AtMinimum(found).minimum.covariance(views.n_equations).shared
     return float(np.sqrt(entries[0, 0])) * views.pixel_scale
 
 
@@ -125,7 +125,7 @@ def test_the_covariance_is_nowhere_below_the_normal_matrix_s(monkeypatch: pytest
     views = arrange(scene.points(0.2, rng))
     found = adjust(views.batches, scene.true_state(views), NO_SKEW, True)
     given = Minimum(views, found.state, found.normal, NO_SKEW, True, own_poses(6)), views.n_equations
-    noise = covariance(*given)
+    noise = given[0].covariance(given[1])
     counted = counting_views(noise, *given)
     scale = np.sqrt(np.diagonal(noise.shared))
     more = (counted.shared - noise.shared) / np.outer(scale, scale)
@@ -181,7 +181,7 @@ def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_
         normal = np.swapaxes(whole, 1, 2) @ whole
         free = np.ones(normal.shape[1] - 7, dtype=bool)
         given = Minimum(None, None, normal, free, True, own_poses(V)), V * rows
-        plain = covariance(*given)
+        plain = given[0].covariance(given[1])
         entries = counting_views(plain, *given).shared
         return np.sqrt(np.diagonal(plain.shared)[:5]), np.sqrt(np.diagonal(entries)[:5])
 

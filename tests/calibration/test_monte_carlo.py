@@ -6,7 +6,6 @@ from support.scenes import Scene, pinhole, table_1
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.views import arrange
@@ -84,7 +83,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     normal, _ = normal_blocks(views.batches, state)
     unknowns, n = UNKNOWNS[1], 2 * len(points)
     normal[0, -1, -1] = (1.0 / views.pixel_scale) ** 2 * (n - unknowns)
-    entries = covariance(Minimum(views, state, normal, problem.free, True), n).shared
+    entries = Minimum(views, state, normal, problem.free, True).covariance(n).shared
     J = scene.intrinsics.entry_jacobian() * views.pixel_scale
     fisher = np.sqrt(np.diag(J @ entries @ J.T))
     assert bound(scene, 1)[:5] == pytest.approx(fisher, rel=1e-4)

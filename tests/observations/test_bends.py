@@ -15,7 +15,6 @@ from support.targets import board
 
 from neurocal_cli import calibrate
 from neurocal_cli.adjustment.board.uncertainty import covariance_basis
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.target_choice import _fit as fit_of
@@ -78,9 +77,9 @@ def test_bends_are_integrated_out_of_what_each_view_tells() -> None:
     target, (problem, adjusted) = found().target, fit_of(found())
     basis = covariance_basis(target, problem.minimum(adjusted), problem.points)
     assert basis.shared is not None
-    views = covariance(basis.minimum, basis.n_equations).shared
+    views = basis.minimum.covariance(basis.n_equations).shared
     np.testing.assert_allclose(np.diagonal(views), np.diagonal(basis.shared), rtol=0.02)
-    fixed = covariance(problem.minimum(adjusted), basis.n_equations).shared
+    fixed = problem.minimum(adjusted).covariance(basis.n_equations).shared
     assert (np.diagonal(fixed) < np.diagonal(basis.shared)).all()
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.candidate_models import fit_candidates
@@ -52,7 +51,7 @@ def reference(points: Correspondences, truth: Truth) -> Reference:
     else:  # the noise without them
         normal = best.normal.copy()
         normal[:, -1, -1] = 2 * problem.views.counts * (truth.sigma / problem.views.pixel_scale) ** 2
-    cov = covariance(problem.minimum(replace(best, normal=normal)), problem.views.n_equations)
+    cov = problem.minimum(replace(best, normal=normal)).covariance(problem.views.n_equations)
     spread = float(np.sqrt(cov.shared[0, 0]) / best.state.entries[0, 0])
     return Reference(truth, spread if np.isfinite(spread) else np.inf)
 

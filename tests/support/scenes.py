@@ -9,7 +9,6 @@ import numpy as np
 
 from neurocal_cli import calibrate
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.problem import Problem, problem_for
 from neurocal_cli.adjustment.reprojection import normal_blocks
@@ -89,7 +88,7 @@ def reference(scene: Scene, points: Correspondences, type: int, skew: bool, sigm
     share = 0.0
     if problem.free[0]:
         m = Minimum(views, start, normal, problem.free, problem.free_poses)
-        bound = covariance(m, 2 * len(points)).shared[0, 0]
+        bound = m.covariance(2 * len(points)).shared[0, 0]
         share = float(np.sqrt(bound) / start.entries[0, 0])
     rmse = float(np.sqrt(fit.cost.sum() / len(points))) * views.pixel_scale
     return Reference(rmse, share)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.adjustment.covariance import CovarianceBasis, counting_views, covariance
+from neurocal_cli.adjustment.covariance import CovarianceBasis, counting_views
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import translations
@@ -98,7 +98,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     """
     basis = _basis(seen, seen.minimum, seen.shared, seen.posterior)
     m, n = basis.minimum, basis.n_equations
-    plain = seen.plain or covariance(m, n + seen.by_prior, basis.shared)
+    plain = seen.plain or m.covariance(n + seen.by_prior, basis.shared)
     if basis.poses is not None:
         plain = plain.with_own(basis.poses)
     if seen.shared is not None:

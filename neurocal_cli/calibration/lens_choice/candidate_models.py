@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import counting_views, covariance
+from neurocal_cli.adjustment.covariance import counting_views
 from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_views, reduced
 from neurocal_cli.adjustment.free_networks import least_of_free_networks
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
@@ -298,7 +298,7 @@ def _assessed(
         if state.model != "none":
             return None
         lost = np.full_like(lost, np.inf)
-    cov = covariance(m, views.n_equations)
+    cov = m.covariance(views.n_equations)
     if repeated is not None:
         cov = counting_views(cov, m, views.n_equations)
     noise = _noise(problem.distortion.model, state, reach, cov.shared)
@@ -330,7 +330,7 @@ def falls_short(fitted: Iterable[Candidate]) -> bool:
 def _is_decentred(omnidir: Candidate) -> bool:
     """Whether p1 and p2 differ from 0, by as many residuals as are independent."""
     problem, views, state = omnidir.problem, omnidir.problem.views, omnidir.adjusted.state
-    C = covariance(problem.minimum(omnidir.adjusted), views.n_equations).shared[-2:, -2:]
+    C = problem.minimum(omnidir.adjusted).covariance(views.n_equations).shared[-2:, -2:]
     if not np.isfinite(C).all():
         return False
     told = state.k[-2:] @ np.linalg.pinv(C, hermitian=True) @ state.k[-2:]

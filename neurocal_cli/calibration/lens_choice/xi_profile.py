@@ -17,7 +17,6 @@ from itertools import pairwise
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.normal_equations import ROUNDING, unit_diagonal
 from neurocal_cli.adjustment.problem import Problem
@@ -161,7 +160,7 @@ class _Profile:
         """Whether the profile over all possible xi agrees with the covariance at the best minimum."""
         problem, best = self.problem, self.best
         free = problem.free_camera
-        cov = covariance(problem.minimum(best), problem.views.n_equations)
+        cov = problem.minimum(best).covariance(problem.views.n_equations)
         variance = float(cov.shared[int(free[:5].sum()), int(free[:5].sum())])
         if not variance > 0 or not cov.smallest > 1e-12:
             return False

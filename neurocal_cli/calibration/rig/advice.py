@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.space_uncertainty import fitted, pixel_moves, shared_covariance
+from neurocal_cli.calibration.rig.space_uncertainty import by_motion, fitted, pixel_moves, shared_covariance
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix, median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import InputError
 
 _MOST = 0.5  # least share of the target's points that the second camera has to see
@@ -117,10 +117,10 @@ class _Pair:
         """Largest std of where the second camera sees what the first one sees, by their own covariance."""
         (first, second), rigs = self.poses, self.fit.state.columns.rigs
         R, whole = second.R @ first.R.T, np.zeros((3, self.fit.state.columns.n_shared))
-        J = _moved(self.middle[None] @ second.R.T, self.fit.problem.unit)[0]
-        for side, by_motion in zip(self.indices, (-J @ np.kron(np.eye(2), R), J), strict=True):
+        J = by_motion(self.middle[None] @ second.R.T, self.fit.problem.unit)[0]
+        for side, moved in zip(self.indices, (-J @ np.kron(np.eye(2), R), J), strict=True):
             if side:
-                whole[:, rigs[side]] = by_motion
+                whole[:, rigs[side]] = moved
         by_own = whole[:, self.columns]
         return float(np.sqrt(max(np.linalg.eigvalsh(by_own @ own @ by_own.T)[-1], 0.0)))
 
@@ -135,7 +135,7 @@ class _Pair:
             points, observed = in_rig[self._shown(which, in_rig)], self.fit.problem.observations[side]
             noise = observed.views.pixel_scale / np.sqrt(observed.weight)
             by_point, by_shared = pixel_moves(self.fit, points, side)
-            both = np.concatenate([by_shared[:, :, self.columns], by_point @ _moved(points, 1.0)], axis=2)
+            both = np.concatenate([by_shared[:, :, self.columns], by_point @ by_motion(points, 1.0)], axis=2)
             rows.append(both.reshape(-1, both.shape[2]) / noise)
         J, P = np.split(np.concatenate(rows), [len(self.columns)], axis=1)
         C = J.T @ P
@@ -165,9 +165,3 @@ class _Pair:
         lines = [in_rig.mean(axis=0) + pose.R.T @ pose.t for pose in self.poses]
         first, second = (float(axes[2] @ line) / float(np.linalg.norm(line)) for line in lines)
         return first * second > 0 and abs(second) > _FACING
-
-
-def _moved(points: Array, unit: float) -> Array:
-    """(N, 3, 6) derivatives of points by a turn about the origin and by a shift in some unit."""
-    shift = np.broadcast_to(unit * np.eye(3), (len(points), 3, 3))
-    return np.concatenate([-cross_matrix(points), shift], axis=2)

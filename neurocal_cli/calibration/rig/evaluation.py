@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibrate import fit_poses
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
 from neurocal_cli.calibration.evaluation import (
-    GivenPoints,
     given_camera,
     given_error,
     other_images,
@@ -343,11 +342,9 @@ class _Evaluator:
         if verdict is None:
             return None
         residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
-        seen = residuals[np.isfinite(residuals)]
-        rmse_px = float(np.sqrt((seen**2).mean())) if seen.size else np.nan
-        given = GivenPoints(rmse_px, len(residuals), len(residuals) - seen.size)
+        squares = residuals[np.isfinite(residuals)] ** 2
         same = "rig, with both cameras as they were"
-        findings = [given_error(verdict, rig.rmse_px, rig.left.points, given, same)]
+        findings = [given_error(verdict, rig.rmse_px, rig.left.points, squares, len(residuals), same)]
         if findings[0][0]:
             findings = [*self._other_size(rig, findings[0][0]), *findings]
         fits = self.fitted or (None, None)

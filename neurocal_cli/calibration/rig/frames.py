@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import planes_are_named
 from neurocal_cli.observations.labels import most_moved
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import distinct_points
 
 _ANY_CAMERA = r"cam(?:era)?[ _-]?[0-9]+(?![0-9])|left|right"
 
@@ -46,7 +46,6 @@ _SIDES = (
     ),
 )
 _LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coincidence
-_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as a share of the target's size
 
 
 @frozen_dataclass
@@ -145,7 +144,7 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
         ids = [np.asarray(side.point)[row].astype(str) for side, row in zip((left, right), rows, strict=True)]
         codes = np.unique(np.concatenate(ids), return_inverse=True)[1].reshape(-1)
     else:
-        codes = _place_codes(np.concatenate([left.world[rows[0]], right.world[rows[1]]]))
+        _, codes, _ = distinct_points([left.select(rows[0]), right.select(rows[1])])
     n_codes = 1 + int(codes.max(initial=0))
     parts = np.split(codes, [len(rows[0])])
     keys = [view * n_codes + code for view, code in zip(order, parts, strict=True)]
@@ -171,19 +170,6 @@ def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.int
     pair = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
     rows = np.flatnonzero(pair >= 0)
     return rows, pair[rows]
-
-
-def _place_codes(world: Array) -> NDArray[np.intp]:
-    """An integer for each place in the world (N, 3), equal for places that differ by rounding only."""
-    size = float(np.ptp(world, axis=0).max(initial=0.0)) or 1.0
-    codes = np.zeros(len(world), dtype=np.intp)
-    for column in world.T:
-        values = np.sort(column)
-        # A new value begins after every gap larger than rounding.
-        starts = values[np.concatenate([[True], np.diff(values) > _SAME_PLACE * size])]
-        codes = codes * len(starts) + np.searchsorted(starts, column, side="right") - 1
-        codes = np.unique(codes, return_inverse=True)[1].reshape(-1)  # small, so no product overflows
-    return codes
 
 
 def _refuse_repeated(points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp]) -> None:

@@ -21,6 +21,7 @@ from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
+from neurocal_cli.calibration.rig.rig import named_std
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
@@ -62,20 +63,16 @@ class RigAssembly:
     def _of_poses(self) -> tuple[Array, list[dict[str, float]]]:
         """Covariance of the angles and translations of all poses; their and the distances' std."""
         n, unit = len(self.poses), self.problem.unit
-        J, followed = np.zeros((n, 7, n, 6)), np.zeros((n, 7))
+        J, followed = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
         for k, pose in enumerate(self.poses):
-            distance = np.linalg.norm(pose.t)
             J[k, :3, k, :3] = euler_jacobian(pose.R)
-            J[k, 3:6, k, 3:] = np.eye(3) * unit
-            J[k, 6, k, 3:] = unit * (pose.t / distance if distance > 0 else 0.0)
-            followed[k, 3:] = *pose.t, distance  # the scale of the target
-        flat = J.reshape(7 * n, 6 * n)
+            J[k, 3:, k, 3:] = np.eye(3) * unit
+            followed[k, 3:] = pose.t  # the scale of the target
+        flat = J.reshape(6 * n, 6 * n)
         block = flat @ self._shared_block(np.concatenate(self.columns.rigs)) @ flat.T
         block += self.scale_std**2 * np.outer(followed, followed)
-        std = np.sqrt(np.maximum(np.diagonal(block), 0.0)).reshape(n, 7).tolist()
-        angles = np.arange(7 * n).reshape(n, 7)[:, :6].ravel()
-        stds = [dict(zip((*POSE_NAMES, "baseline"), one, strict=True)) for one in std]
-        return block[np.ix_(angles, angles)], stds
+        own = [slice(6 * k, 6 * k + 6) for k in range(n)]
+        return block, [named_std(block[at, at], pose.t) for at, pose in zip(own, self.poses, strict=True)]
 
     @property
     def delays(self) -> list[tuple[float, float]]:

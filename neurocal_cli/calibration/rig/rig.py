@@ -287,7 +287,7 @@ class Rig(FixedCameras):
         else:
             pose = self.poses[right].relative_to(self.poses[left])
             covariance = self._relative_covariance((left, right), pose)
-            std = _named_std(covariance, pose.t)
+            std = named_std(covariance, pose.t)
         cameras = self.cameras[left], self.cameras[right]
         pairs = tuple(
             (views[left], views[right]) for views in self.frames.values() if {left, right} <= set(views)
@@ -346,7 +346,7 @@ class Rig(FixedCameras):
         return np.asarray(J @ self.covariance @ J.T)
 
 
-def _named_std(covariance: Array, t: Array) -> dict[str, float]:
+def named_std(covariance: Array, t: Array) -> dict[str, float]:
     """Standard deviations of angles and translation by name, and of the baseline."""
     distance = float(np.linalg.norm(t))
     along = t / distance if distance > 0 else np.zeros(3)

@@ -74,8 +74,13 @@ def in_camera(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
     """Points (N, 3) of the first camera's frame in another one, and their derivatives by its pose."""
     state, unit = fit.state, fit.problem.unit
     turned = points @ state.R[side].T
+    return turned + unit * state.t[side], by_motion(turned, unit)
+
+
+def by_motion(points: Array, unit: float) -> Array:
+    """(N, 3, 6) derivatives of points by a turn about the origin and by a shift in some unit."""
     shift = np.broadcast_to(unit * np.eye(3), (len(points), 3, 3))
-    return turned + unit * state.t[side], np.concatenate([-cross_matrix(turned), shift], axis=2)
+    return np.concatenate([-cross_matrix(points), shift], axis=2)
 
 
 def pixel_moves(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:

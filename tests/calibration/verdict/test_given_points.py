@@ -32,7 +32,7 @@ def other_images(focal: float = 600.0, seed: int = 9) -> Correspondences:
 
 def word(points: Correspondences) -> str:
     assert found().verdict is not None
-    return judged_by_points(found().verdict, found(), evaluate_camera(found(), points).given_points).word
+    return judged_by_points(found().verdict, found(), evaluate_camera(found(), points)).word
 
 
 def test_other_images_of_known_names_get_poses_of_their_own() -> None:
@@ -95,7 +95,7 @@ def test_new_views_of_good_cameras_are_good(trials: range) -> None:
         camera = calibrate(points.select(points.view_index < n), distortion="none", skew=False)
         evaluation = evaluate_camera(camera, points.select(points.view_index >= n))
         assert camera.verdict is not None
-        changed += judged_by_points(camera.verdict, camera, evaluation.given_points) != camera.verdict
+        changed += judged_by_points(camera.verdict, camera, evaluation) != camera.verdict
     assert changed <= len(trials) // 100
 
 
