@@ -274,10 +274,7 @@ class Search:
                 found = given_posterior(info, self.prior)
             else:
                 if known:
-                    parts = [
-                        WithoutPoses(part, np.flatnonzero(folded.fold == k))
-                        for k, part in enumerate(folded.parts(info, self._in_offsets))
-                    ]
+                    parts = [WithoutPoses(part) for part in folded.parts(info, self._in_offsets)]
                 found = posterior(info, self.prior, self.sizes, self.absent, noise, step == 0, parts)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None

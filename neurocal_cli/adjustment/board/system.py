@@ -10,12 +10,11 @@ the work grows linearly with the number of views or of points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.board.information import Information
 from neurocal_cli.adjustment.board.prior import Gauge, Parts, Prior, coordinates_of
@@ -26,23 +25,21 @@ from neurocal_cli.camera.geometry import Array
 class WithoutPoses:
     """Information with the poses eliminated; results for different views can be added.
 
-    With the lower triangular Cholesky factors L of the poses' matrices, `root` (P, p, p) is their inverses,
-    and `rows` (P p, f + 3 n + 1) the products of these with the coupling to cameras, offsets and the right
-    side. `logdet` is the log determinant of the poses' part, and `poses` (P,) are the indices of the poses
-    among those of all views.
+    `rows` (P p, f + 3 n + 1) are the inverses of the lower triangular Cholesky factors of the poses' matrices
+    times the coupling to cameras, offsets and the right side. `logdet` is the log determinant of the poses'
+    part.
     """
 
-    def __init__(self, info: Information, poses: NDArray[np.intp] | None = None) -> None:
+    def __init__(self, info: Information) -> None:
         self.info, (P, p), d = info, info.pose_point.shape[:2], 3 * len(info.point)
-        self.poses = np.arange(P) if poses is None else poses
-        self.root, cross = np.linalg.inv(np.linalg.cholesky(info.cameras.own)), info.cameras.cross
+        root, cross = np.linalg.inv(np.linalg.cholesky(info.cameras.own)), info.cameras.cross
         f = len(info.cameras.shared) - 1
         rows = np.empty((P, p, f + d + 1))
-        np.matmul(self.root, cross[:, :, :-1], out=rows[:, :, :f])
-        np.matmul(self.root, info.pose_point.reshape(P, p, d), out=rows[:, :, f:-1])
-        np.matmul(self.root, cross[:, :, -1:], out=rows[:, :, -1:])
+        np.matmul(root, cross[:, :, :-1], out=rows[:, :, :f])
+        np.matmul(root, info.pose_point.reshape(P, p, d), out=rows[:, :, f:-1])
+        np.matmul(root, cross[:, :, -1:], out=rows[:, :, -1:])
         self.rows = rows.reshape(P * p, f + d + 1)
-        self.logdet = -2 * float(np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum())
+        self.logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
 
     @cached_property
     def matrix(self) -> Array:
@@ -99,15 +96,13 @@ class JointCovariance:
     """Covariance of cameras, offsets and poses for unit noise.
 
     The covariance of two unknowns is the product of their columns in the roots. To that of the offsets of
-    one point, `own` is added.
+    one point, `own` is added. The poses follow by the quadratic.
     """
 
     camera_root: Array  # (d, f)
     offset_root: Array  # (d, 3 n)
     own: Array  # (n, 3, 3)
-    # Of each group of poses: their indices (p,), covariances (p, 6, 6) for known other unknowns, and roots
-    # (p, 6, d) of the rest.
-    pose_parts: Callable[[], Iterable[tuple[NDArray[np.intp], Array, Array]]]
+    info: Information
 
     def offset_variance(self, gauge: Gauge) -> Array:
         """(n, 3) variance of the offsets with the gauge held.
@@ -126,16 +121,21 @@ class JointCovariance:
 
     def poses(self, gauge: Gauge) -> Array:
         """(P, 6, 6) covariance of each pose of a target whose gauge is held."""
-        by_gauge, H = self.offset_root @ gauge.held, self._of_points(gauge.held)
-        of_gauge = np.linalg.inv(by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", H, self.own @ H))
-        groups = list(self.pose_parts())
-        found = np.empty((sum(len(which) for which, *_ in groups), 6, 6))
-        for which, own, root in groups:
-            across = root @ by_gauge
-            found[which] = (
-                own + root @ np.swapaxes(root, 1, 2) - across @ of_gauge @ np.swapaxes(across, 1, 2)
-            )
-        return found
+        by_gauge, own = self.offset_root @ gauge.held, self.own @ self._of_points(gauge.held)
+        of_gauge = np.linalg.inv(by_gauge.T @ by_gauge + gauge.held.T @ own.reshape(gauge.held.shape))
+        cameras, pose_point = self.info.cameras, self.info.pose_point
+        inverse = np.linalg.inv(cameras.own)[:, :6]
+        by_points = (inverse @ pose_point.reshape(*pose_point.shape[:2], -1)).reshape(-1, 6, *own.shape[:2])
+        flat = by_points.reshape(-1, self.offset_root.shape[1])
+        root = ((inverse @ cameras.cross[:, :, :-1]) @ self.camera_root.T).reshape(-1, 6, len(by_gauge))
+        root += (flat @ self.offset_root.T).reshape(root.shape)
+        across = root @ by_gauge + (flat @ own.reshape(gauge.held.shape)).reshape(len(root), 6, -1)
+        alone = inverse[:, :, :6] + np.einsum(
+            "vqni,nij,vrnj->vqr", by_points, self.own, by_points, optimize=True
+        )
+        return np.asarray(
+            alone + root @ np.swapaxes(root, 1, 2) - across @ of_gauge @ np.swapaxes(across, 1, 2)
+        )
 
 
 def system_of(
@@ -163,10 +163,10 @@ class PosesFirst:
     """
 
     def __init__(self, info: Information, prior: Prior, parts: Sequence[WithoutPoses] = ()) -> None:
-        self.parts = parts or [WithoutPoses(info)]
-        self.coordinates, self.f = coordinates_of(prior), len(info.cameras.shared) - 1
-        self.of_poses = sum(part.logdet for part in self.parts)
-        M = self._by_coordinates(self._by_coordinates(np.asarray(sum(part.matrix for part in self.parts))).T)
+        parts = parts or [WithoutPoses(info)]
+        self.info, self.coordinates, self.f = info, coordinates_of(prior), len(info.cameras.shared) - 1
+        self.of_poses = sum(part.logdet for part in parts)
+        M = self._by_coordinates(self._by_coordinates(np.asarray(sum(part.matrix for part in parts))).T)
         self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
 
     def _by_coordinates(self, rows: Array) -> Array:
@@ -194,19 +194,9 @@ class PosesFirst:
         )  # fmt: skip
 
     def _joint(self, root: Array) -> JointCovariance:
-        n, camera = len(self.coordinates.prior.axes), root[:, : self.f]
+        n = len(self.coordinates.prior.axes)
         offsets = self.coordinates.offsets(root[:, self.f :]).reshape(len(root), 3 * n)
-
-        def poses() -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
-            others = np.concatenate([camera, offsets], axis=1).T
-            for part in self.parts:
-                P, p = part.root.shape[:2]
-                inverse = np.swapaxes(part.root, 1, 2)[:, :6]
-                gain = inverse @ part.rows[:, :-1].reshape(P, p, -1)
-                by_root = (gain.reshape(6 * P, -1) @ others).reshape(P, 6, len(root))
-                yield part.poses, inverse @ np.swapaxes(inverse, 1, 2), by_root
-
-        return JointCovariance(camera, offsets, np.zeros((n, 3, 3)), poses)
+        return JointCovariance(root[:, : self.f], offsets, np.zeros((n, 3, 3)), self.info)
 
 
 class PointsFirst:
@@ -248,7 +238,7 @@ class PointsFirst:
 
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
-        f, s, n, P, p = self.f, self.s, self.n, self.P, self.p
+        f, s, n = self.f, self.s, self.n
         of_smooth, of_single = self.prior.variances(ratios)
         own_root = np.linalg.inv(np.linalg.cholesky(self.info.point + np.eye(3) / of_single[:, :, None]))
         rows = own_root @ self.by_point
@@ -267,8 +257,7 @@ class PointsFirst:
 
         def joint() -> JointCovariance:
             offsets = single() + smooth @ self.prior.basis.reshape(3 * n, -1).T
-            poses = root[:, s:].reshape(len(x), P, p)[:, :, :6].transpose(1, 2, 0)
-            return JointCovariance(camera, offsets, own, lambda: [(np.arange(P), np.zeros((P, 6, 6)), poses)])
+            return JointCovariance(camera, offsets, own, self.info)
 
         def parts() -> Parts:
             free = np.concatenate([smooth, single()], axis=1)
