@@ -22,7 +22,6 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_names import NAMES
 from neurocal_cli.files.exchange.corner_tables import (
     Given,
@@ -35,17 +34,10 @@ from neurocal_cli.files.exchange.corner_tables import (
     table_of,
     vnl,
 )
-from neurocal_cli.files.exchange.document import (
-    KALIBR_REPORT,
-    array_of,
-    arrays_of,
-    camera_matrix,
-    few_numbers,
-)
+from neurocal_cli.files.exchange.document import KALIBR_REPORT, PACKED, Document, camera_matrix
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.mat_file import read_variables
+from neurocal_cli.files.exchange.mat_file import MARK, read_variables
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, unit_of
-from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.tree_fields import Field, plain
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences
@@ -82,26 +74,22 @@ def read_corners(
     well is left to it, unless `what` is "points".
     """
     names = [str(path) for path in paths]
-    data, source = read_bytes(names[0])
+    document = Document(names[0])
+    source, text = document.source, document.text
     given = Given(board, unit, what == "points", advice, notes)
-    if len(names) == 1 and data.startswith(b"\x93NUMPY"):
-        array = array_of(data, source)
-        if camera_matrix(array) is not None:
-            return None  # a camera matrix
-        return _corners(Field({"corners": array.tolist()}, source), given)
-    if data.startswith(b"PK\x03\x04"):
-        return _corners(Field(arrays_of(data, source, []), source), given)
-    if data.startswith(b"MATLAB 5.0 MAT-file"):
-        return _matlab(data, source, given)
-    if b"\0" in data or data.startswith(b"\x80"):
+    if document.data.startswith(MARK):
+        return _matlab(document, given)
+    if document.data.startswith(PACKED):
+        return _corners(document.root, given)
+    if document.array is not None and camera_matrix(document.array) is not None:
         return None
-    text = decode(data, source)
+    if not document.is_text:
+        found = document.array if len(names) == 1 else None
+        return None if found is None else _corners(Field({"corners": found.tolist()}, source), given)
     if re.match(KALIBR_REPORT[0], text):
         raise FormatError(KALIBR_REPORT[1], source)
     if _VNL.match(text):
         return vnl(text, source, given)
-    if camera_matrix(few_numbers(text)) is not None:
-        return None
     if _NUMBERS.match(text):
         return separate(names, given)
     if board is not None and is_of_cells(text):
@@ -110,7 +98,7 @@ def read_corners(
         return table_of(names, given)
     named = {plain(name) for name in re.findall(r"^(\w+)\s*:", text, re.MULTILINE)}
     if not named.isdisjoint(_PIXELS) or text.lstrip().startswith(("{", "<", "%YAML", "/", "[{", "[\n")):
-        return _corners(parse_tree(text, source), given)
+        return _corners(document.root, given)
     return None
 
 
@@ -228,8 +216,8 @@ def _stack(field: Field, width: int) -> Array:
     return array
 
 
-def _matlab(data: bytes, source: str, given: Given) -> Correspondences | None:
-    tree = read_variables(data, source)
+def _matlab(document: Document, given: Given) -> Correspondences | None:
+    source, tree = document.source, read_variables(document.data, document.source)
     if not given.points and ("fc" in tree or not {*STRUCTS, "K"}.isdisjoint(tree)):
         return None
     field = next((name for name in tree if plain(name) in _PIXELS), None)

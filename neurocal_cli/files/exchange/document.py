@@ -32,6 +32,7 @@ _DAMAGED = (
     ValueError, OSError, EOFError, KeyError, MemoryError, SyntaxError, TokenError, NotImplementedError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
+PACKED = b"PK\x03\x04"  # how a ZIP archive begins, as which NumPy writes several arrays
 FROM_ZERO = (
     "its first pixel is taken as 0, as OpenCV has it; if MATLAB calibrated the camera, subtract 1 from the "
     "principal point"
@@ -128,7 +129,7 @@ class Document:
     @cached_property
     def root(self) -> Field:
         """The tree of the file; a FormatError says what is wrong with it."""
-        if self.data.startswith(b"PK\x03\x04"):
+        if self.data.startswith(PACKED):
             return Field(arrays_of(self.data, self.source, self.notes), self.source)
         if self.data.startswith(MARK):
             self.is_script = True
