@@ -8,9 +8,6 @@ available), not by its loaders. That is 9 times faster on calibration files (100
 ``CSafeLoader`` 345 ms), and aliases can be refused (a few lines of them can expand to gigabytes), as can
 duplicate keys and absurd nesting. Tags are ignored, so OpenCV's ``!!opencv-matrix`` is read like any mapping.
 Keys of mappings stay text: a view called ``1e5`` or ``null`` keeps its name.
-
-A long table of JSON-compatible rows, the form in which observations are written, is parsed as JSON, 50 times
-faster.
 """
 
 from __future__ import annotations
@@ -51,14 +48,7 @@ _WORDS: dict[str, Any] = {
     **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
-# The table as written by `observations_yaml`, at any indentation.
-_ROWS = re.compile(
-    r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
-    re.MULTILINE,
-)
 _OPENCV = re.compile(r"%YAML:[^\n]*\n")
-_LABELS = frozenset(("view", "point"))
-_CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
 
 def number(value: float) -> str:
@@ -164,45 +154,15 @@ def parse_yaml(text: str, source: str) -> Any:
         text = cut[0] + re.sub(r"(?m)^( *[A-Za-z_][\w.-]*):(?=[^\s:/\\])", r"\1: ", text[cut.end() :])
     text = re.sub(r"\A%YAML[: ][^\n]*", "", text)  # OpenCV writes %YAML:1.0, which YAML parsers refuse
     text = re.sub(r"\n---[ \t]*\s*\Z", "\n", text)  # rostopic echo ends each message so
-    text, tables = _cut_rows(text)
     try:
-        return _assemble(text, tables, source)
+        return _assemble(text, source)
     except yaml.YAMLError as error:
         raise _syntax_error(error, text, source) from error
     except (RecursionError, UnicodeError) as error:
         raise FormatError("is not readable YAML; write it again", source) from error
 
 
-def _cut_rows(text: str) -> tuple[str, list[Any]]:
-    """Cut tables of rows out of the text, keeping the number of lines."""
-    tables: list[Any] = []
-
-    def cut(match: re.Match[str]) -> str:
-        rows = match["rows"]
-        separator = "\n" + rows[: rows.index("[")]  # older versions wrote less indentation
-        try:
-            table = json.loads(
-                "[" + rows[len(separator) - 1 : -1].replace(separator, ",\n") + "]", parse_constant=_refuse
-            )
-        except (ValueError, RecursionError):
-            return match[0]
-        labels = [k for k, name in enumerate(match[2].split(", ")) if name in _LABELS]
-        if len(table) != rows.count("\n") or not all(type(row) is list for row in table):
-            return match[0]  # brackets are not balanced within each line
-        if not all(len(row) > k and type(row[k]) is str for k in labels for row in table):
-            return match[0]  # an unquoted name such as 1e5 is a number in JSON, but text here
-        tables.append(table)
-        head = match[0][: match.start("rows") - match.start() - 1]
-        return f"{head} {_CUT} {len(tables) - 1}" + "\n" * (len(table) + 1)
-
-    return _ROWS.sub(cut, text), tables
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(constant)  # NaN is a number in JSON, but a string in YAML
-
-
-def _assemble(text: str, tables: list[Any], source: str) -> Any:
+def _assemble(text: str, source: str) -> Any:
     """Build the tree from the parser's events without recursion."""
     root: list[Any] = []
     containers: list[Any] = [root]  # innermost last
@@ -219,8 +179,6 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
                 continue
             if not event.style:
                 value = value if str(event.tag).endswith(":str") else plain_value(value)
-            if event.tag == _CUT and type(value) is int and 0 <= value < len(tables):
-                value = tables[value]
         elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
             if type(containers[-1]) is dict and keys[-1] is None:
                 _fail("a key must be a word, not a list or mapping; correct it", event, source)
