@@ -101,7 +101,9 @@ class Columns:
             if kind == "label":
                 columns[names[0]] = list(map(str, own))
             else:
-                numbers = np.asarray(own, dtype=int if kind == "integer" else float).reshape(len(own), -1)
+                numbers = np.asarray(own, dtype=int if kind == "integer" else float).reshape(
+                    len(own), len(names)
+                )
                 columns |= {name: numbers[:, k] for k, name in enumerate(names)}
         return columns
 
@@ -111,13 +113,14 @@ class Columns:
         if long:
             yield from block("columns", column_lines(columns))
             return
+        yield f"columns: [{', '.join(columns)}]"
         cells = [
             number_words(values) if isinstance(values, np.ndarray) else map(quoted, values)
             for values in columns.values()
         ]
-        yield f"columns: [{', '.join(columns)}]"
-        yield "rows:"
-        yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
+        rows = indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
+        yield "rows:" if rows else "rows: []"
+        yield from rows
 
     def listed(self, columns: Field) -> list[str]:
         """The names of columns, those of the table and with all that it needs."""

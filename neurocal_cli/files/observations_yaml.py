@@ -7,13 +7,11 @@ view, whose numbers are texts: decimals, or packed if PyYAML would take too long
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from operator import add
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import value_failures
 from neurocal_cli.files.key_tables import (
     LONGEST,
@@ -32,7 +30,7 @@ from neurocal_cli.files.key_tables import (
 )
 from neurocal_cli.files.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import flow, indented, number, quoted
+from neurocal_cli.files.yaml_text import block, indented, number, quoted
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.points import Correspondences
 
@@ -67,26 +65,15 @@ _MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
 
 def observation_lines(points: Correspondences, long: bool) -> list[str]:
     """Lines of the block ``observations``."""
-    names, blocks = value_columns(points)
-    columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
-    lines = ["observations:", f"  columns: [{', '.join(columns)}]"]
-    lines += indented(_HEAD.lines(points))
-    if len(points) == 0:
-        return [*lines, "  rows: []"]
-    if long:
-        return [*lines, *indented(_long_lines(points, np.hstack(blocks)))]
-    # OpenCV's FileStorage requires rows to be indented more than their key.
-    heads = [f"    - [{quoted(name)}, " for name in points.view_names]
-    heads = [heads[k] for k in points.view_index.tolist()]
-    if points.point is not None:
-        labels = np.asarray(points.point).tolist()
-        ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
-        heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
-    numbers = flow(np.hstack([points.world, *blocks]))
-    return [*lines, "  rows:", *map(add, heads, numbers[2:-1].split(", ["))]
+    table = {name: getattr(points, name) for name in ("point", "world", "pixels", *OPTIONAL)}
+    table["view"] = [points.view_names[k] for k in points.view_index.tolist()]
+    lines = _COLUMNS.lines(table, long=False)
+    head = [next(lines), *_HEAD.lines(points)]
+    return block("observations", [*head, *(_long_lines(points) if long and len(points) else lines)])
 
 
-def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
+def _long_lines(points: Correspondences) -> Iterator[str]:
+    values = np.hstack(value_columns(points)[1])
     place, first = _places(points)
     labels = {} if points.point is None else {"point": np.asarray(points.point)[first].astype(str).tolist()}
     coordinates = {name: points.world[first, k] for k, name in enumerate(PLACE)}
