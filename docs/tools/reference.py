@@ -16,9 +16,9 @@ from man_pages import man_pages, root, walk
 import neurocal_cli
 from neurocal_cli.commands import neurocal
 from neurocal_cli.files.board_kinds import COUNTED, KINDS, short_form
+from neurocal_cli.files.board_yaml import FORMATS as BOARDS
 from neurocal_cli.files.exchange.corners import KEYS
 from neurocal_cli.files.exchange.reading import FORMATS, READ
-from neurocal_cli.files.other_boards import FORMATS as BOARDS
 from neurocal_cli.files.points_csv import POINTS
 
 DOCS = Path(__file__).resolve().parents[1]

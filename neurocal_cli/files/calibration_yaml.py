@@ -28,6 +28,8 @@ from neurocal_cli.errors import value_failures
 from neurocal_cli.files.calibration_blocks import (
     VERDICT,
     have_same_std,
+    observation_lines,
+    read_observations,
     read_rejected,
     read_target,
     read_views,
@@ -49,7 +51,6 @@ from neurocal_cli.files.key_tables import (
     read_numbers,
     record,
 )
-from neurocal_cli.files.observations_yaml import observation_lines, read_observations
 from neurocal_cli.files.reading import is_point_table
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import block, flows, text

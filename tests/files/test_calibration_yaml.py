@@ -191,7 +191,7 @@ def all_files_are_long():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("neurocal_cli.files.calibration_yaml._MOST_POINTS", 0)
         patch.setattr("neurocal_cli.files.key_tables.LONGEST", 2)
-        patch.setattr("neurocal_cli.files.observations_yaml.LONGEST", 2)
+        patch.setattr("neurocal_cli.files.calibration_blocks.LONGEST", 2)
         yield
 
 
