@@ -260,7 +260,7 @@ def _holders(value: Any, around: Tree, source: str, name: str = "", depth: int =
     named = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, part in named if depth else ():
         if isinstance(part, (dict, list)):
-            beside = around | _beside(value, key) if isinstance(value, dict) else around
+            beside = around | _beside(value, str(key)) if isinstance(value, dict) else around
             found += _holders(part, beside, source, str(key), depth - 1)
     return found
 
