@@ -22,7 +22,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhol
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, rotation_to_axis
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
-from neurocal_cli.camera.projection import ENTRIES, image_points, undistorted_pixels
+from neurocal_cli.camera.projection import ENTRIES, image_points
 from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError, UsageError
@@ -362,7 +362,8 @@ def _views_of(
             "check that the camera belongs to these images"
         )
     if not distortion.wide:
-        return arrange(replace(points, pixels=undistorted_pixels(distortion, camera.A, seen))), None
+        straight = image_points(camera.entries, "none", (), *camera.normalised_points(*seen.T))
+        return arrange(replace(points, pixels=np.column_stack(straight))), None
     pixels, turned = _turned_pixels(points, rays, camera)
     behind = ~np.isfinite(pixels[:, 0])
     if behind.any():

@@ -190,10 +190,3 @@ def rays_of(
     scale = 1 / (ux * vy - uy * vx)
     xu, xv, yu, yv = (np.broadcast_to(d * scale, x.shape) for d in (vy, -uy, -vx, ux))
     return Rays(u, v, x, y, xu, xv, yu, yv)
-
-
-def undistorted_pixels(distortion: Distortion, A: Array, pixels: Array) -> Array:
-    """Pixels (N, 2) in the same camera without distortion; nan for pixels that the lens cannot produce."""
-    entries = A[ENTRIES].tolist()
-    x, y = undistort(distortion, *normalised_points(entries, pixels[:, 0], pixels[:, 1]))
-    return np.column_stack(image_points(entries, "none", (), x, y))

@@ -83,7 +83,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     rng = np.random.default_rng(4)
     scene = random_rig(rng, "verging", 4)
     left, right = (calibrate(scene.points(side, 1e-4, rng), skew=False, target="given") for side in (0, 1))
-    problem = stereo_problem(left, right, pair_views(left.points.view_names, right.points.view_names).both)
+    problem = stereo_problem(left, right, pair_views(left.points.view_names, right.points.view_names))
     free = np.concatenate([*problem.estimated, [True] * 6])
     adjusted = adjust_rig(problem, problem.start([scene.rig]), free)
     only(0, monkeypatch)

@@ -33,10 +33,11 @@ from neurocal_cli.camera.monotonic import (
     monotonic_radius,
     radial_slope,
     reaches,
+    undistort,
     unproject_directions,
 )
 from neurocal_cli.camera.polynomial import untilted
-from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
+from neurocal_cli.camera.projection import ENTRIES, normalised_points
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
@@ -142,7 +143,7 @@ def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
     x, y = normalised_points(A[ENTRIES].tolist(), *pixels.T)
     if distortion.wide:
         return bool(np.isfinite(unproject_directions(distortion, x, y)[0]).all())
-    return bool(np.isfinite(undistorted_pixels(distortion, A, pixels)).all())
+    return bool(np.isfinite(undistort(distortion, x, y)).all())
 
 
 @quietly

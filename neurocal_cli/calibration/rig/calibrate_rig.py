@@ -286,7 +286,6 @@ def fit_stereo(
     *,
     refine_cameras: bool = False,
     outliers: str = "reject",
-    target_kept: bool = False,
 ) -> StereoRig:
     """Find the pose of the right camera relative to the left one from the views of both.
 
@@ -298,8 +297,6 @@ def fit_stereo(
         estimated. Otherwise it refines the rig and the poses alone.
     outliers : {"reject", "keep"}
         Whether pairs of views that contradict most others are left out of the rig with a warning, or raise.
-    target_kept : bool
-        Whether the given target was kept although it could have been estimated from both cameras.
 
     Returns
     -------
@@ -317,9 +314,7 @@ def fit_stereo(
         An unknown option.
     """
     cameras = dict(zip(_SIDES, on_one_target(left, right), strict=True))
-    return _stereo(
-        fit_rig(cameras, refine_cameras=refine_cameras, outliers=outliers, target_kept=target_kept)
-    )
+    return _stereo(fit_rig(cameras, refine_cameras=refine_cameras, outliers=outliers))
 
 
 def _stereo(rig: Rig) -> StereoRig:

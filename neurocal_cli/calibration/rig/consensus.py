@@ -269,7 +269,7 @@ def with_agreeing_poses(cameras: list[Calibration], views: FrameNames) -> list[C
         for b in range(a + 1, len(cameras)):
             both = tuple((frames[a][k], frames[b][k]) for k in frames[a].keys() & frames[b].keys())
             if both:
-                cameras[a], cameras[b] = _of_two(cameras[a], cameras[b], ViewPairs(both))
+                cameras[a], cameras[b] = _of_two(cameras[a], cameras[b], both)
     return cameras
 
 
@@ -277,9 +277,7 @@ def _of_two(left: Calibration, right: Calibration, views: ViewPairs) -> tuple[Ca
     """Both cameras, with the poses of paired views on which they agree, and no second poses of these."""
     if not (left.second_poses or right.second_poses):
         return left, right
-    offers = [
-        [(a, b) for a in _possible(left, one) for b in _possible(right, other)] for one, other in views.both
-    ]
+    offers = [[(a, b) for a in _possible(left, one) for b in _possible(right, other)] for one, other in views]
     padded = [[*some, *[some[0]] * (4 - len(some))] for some in offers]
     R_left, R_right = (np.array([[o[side].pose.R for o in some] for some in padded]) for side in (0, 1))
     t_left, t_right = (np.array([[o[side].pose.t for o in some] for some in padded]) for side in (0, 1))
@@ -287,10 +285,10 @@ def _of_two(left: Calibration, right: Calibration, views: ViewPairs) -> tuple[Ca
     t = t_right - (R @ t_left[..., None])[..., 0]  # (P, 4, 3)
     away = _nearest(R, t, np.linalg.norm(t_left, axis=2))
     sides = [dict(left.views), dict(right.views)]
-    for pair, some, offer in zip(views.both, padded, away, strict=True):
+    for pair, some, offer in zip(views, padded, away, strict=True):
         for side, name, view in zip(sides, pair, some[int(offer)], strict=True):
             side[name] = replace(view, std=side[name].std, probability=1.0)
-    names = [{pair[side] for pair in views.both} for side in (0, 1)]
+    names = [{pair[side] for pair in views} for side in (0, 1)]
     return _settled(left, sides[0], names[0]), _settled(right, sides[1], names[1])
 
 

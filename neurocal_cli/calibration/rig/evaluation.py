@@ -29,7 +29,7 @@ from neurocal_cli.calibration.evaluation import (
 )
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo, poses_on_rig
-from neurocal_cli.calibration.rig.frames import Pairs, frames_of_pairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.frames import Pairs, frames_of_pairs, pair_points, pair_views, unpaired
 from neurocal_cli.calibration.rig.rig import StereoRig, of_two
 from neurocal_cli.calibration.rig.triangulation import Method, triangulate
 from neurocal_cli.calibration.target_choice import on_one_target
@@ -264,12 +264,12 @@ class _Evaluator:
             camera.views.keys() - (other_images(camera, some) if self.given else ())
             for camera, some in zip(cameras, self.points, strict=True)
         ]
-        self.new = [pair for pair in self.views.both if pair[0] not in known[0] or pair[1] not in known[1]]
+        self.new = [pair for pair in self.views if pair[0] not in known[0] or pair[1] not in known[1]]
         self.fitted = self._fit_new() if self.new else None
 
     def evaluation(self) -> StereoEvaluation:
         """The errors of all points, through the poses of the views and through the rig."""
-        rig, pairs, through = self.rig, self.views.both, None
+        rig, pairs, through = self.rig, self.views, None
         by_view = self._error(*self._own_poses(pairs), np.ones(len(pairs), dtype=bool))
         judgement: Callable[[], Verdict | None] = self._judgement
         if rig is not None:
@@ -298,7 +298,7 @@ class _Evaluator:
             rig=through,
             baseline=float("nan") if rig is None else rig.baseline,
             pairs=pairs,
-            alone=(self.views.left_only, self.views.right_only),
+            alone=unpaired(self.points[0].view_names, self.points[1].view_names, pairs),
             fitted=tuple(a for a, _ in self.new),
             models=(self.cameras[0].distortion_model, self.cameras[1].distortion_model),
             warnings=tuple(self.warnings),
@@ -383,7 +383,7 @@ class _Evaluator:
         """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""
         if side == 1:
             poses = [Pose.exact(rig.R @ pose.R, rig.R @ pose.t + rig.t) for pose in poses]
-        place = {pair[side]: k for k, pair in enumerate(self.views.both) if pair not in rig.left_out}
+        place = {pair[side]: k for k, pair in enumerate(self.views) if pair not in rig.left_out}
         points = self.points[side]
         some = points.select(np.array([name in place for name in points.view_names])[points.view_index])
         camera = self.cameras[side].camera
@@ -403,7 +403,7 @@ class _Evaluator:
             method=self.method,
         )
         true = in_cameras(poses, self.points[0].world[pairs.left], pairs.view)
-        names = [a for a, _ in self.views.both]
+        names = [a for a, _ in self.views]
         triangulated = np.where(found.behind[:, None], np.nan, found.points)
         K = self.cameras[0].intrinsics
         return space_error(triangulated, true, found.epipolar, pairs.view, names, K.alpha_u, K.alpha_v)

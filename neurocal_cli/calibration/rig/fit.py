@@ -56,28 +56,11 @@ def fit_rig(
     outliers: str = "reject",
     target_kept: bool = False,
 ) -> Rig:
-    """Find the poses of cameras relative to the first one from the views of all.
+    """Find the poses of cameras on one target, by name, relative to the first one, from the views of all.
 
-    Parameters
-    ----------
-    cameras : dict of Calibration by name
-        On one target, in one world unit. Their frames are as `connected_frames` finds them.
-    refine_cameras : bool
-        Whether the bundle adjustment also refines the intrinsic parameters and distortions that were
-        estimated. Otherwise it refines the rig and the poses alone.
-    outliers : {"reject", "keep"}
-        Whether views that contradict most others are left out of the rig with a warning, or raise.
-    target_kept : bool
-        Whether the given target was kept although it could have been estimated from all cameras.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Views that contradict each other.
-    CoincidentCamerasError
-        Two cameras at one place.
-    UsageError
-        An unknown option.
+    It is `fit_stereo` for any number of cameras, with the same options and errors. Their frames are as
+    `connected_frames` finds them. `target_kept` tells whether the given target was kept although it could
+    have been estimated from all cameras.
     """
     if outliers not in ("reject", "keep"):
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")

@@ -17,7 +17,7 @@ The points of a pair of views are paired by their ids or, if one of the files ha
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import planes_are_named
-from neurocal_cli.observations.labels import most_moved
+from neurocal_cli.observations.labels import first_repeat, most_moved
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import distinct_points
 
@@ -48,13 +48,8 @@ _SIDES = (
 _LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coincidence
 
 
-@frozen_dataclass
-class ViewPairs:
-    """Names of paired and of single views."""
-
-    both: tuple[tuple[str, str], ...]  # left and right, in the order of the left camera
-    left_only: tuple[str, ...] = ()
-    right_only: tuple[str, ...] = ()
+ViewPairs = Sequence[tuple[str, str]]
+"""Names of views of a left and a right camera that were taken together."""
 
 
 @frozen_dataclass(eq=False)
@@ -66,8 +61,8 @@ class Pairs:
     view: NDArray[np.intp]  # (N,) number of the pair, sorted
 
 
-def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
-    """Pair the names of two cameras' views.
+def pair_views(left: Sequence[str], right: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Pair the names of two cameras' views, in the order of the left one.
 
     Errors are no view, no pair, ambiguous names, and names that show that the cameras are swapped.
     """
@@ -95,12 +90,16 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
             f"{_listed(right)}; give views taken together the same name, or names such as left01 and "
             "right01, in which left and right touch no other letter"
         )
-    paired = set(sum(both, ()))
-    return ViewPairs(
-        both,
-        tuple(name for name in left if name not in paired),
-        tuple(name for name in right if name not in paired),
-    )
+    return both
+
+
+def unpaired(
+    left: Iterable[str], right: Iterable[str], pairs: ViewPairs
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the views of the left camera alone and of the right camera alone."""
+    sides = (left, {a for a, _ in pairs}), (right, {b for _, b in pairs})
+    alone, other = (tuple(name for name in names if name not in paired) for names, paired in sides)
+    return alone, other
 
 
 def _keys(names: Sequence[str], words: re.Pattern[str], camera: str | None) -> dict[str, str]:
@@ -137,7 +136,7 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
         raise InputError(
             f"{left.source} is in {left.unit}, {right.source} in {right.unit}; give both in the same unit"
         )
-    sides = _in_pairs(left, [a for a, _ in views.both]), _in_pairs(right, [b for _, b in views.both])
+    sides = _in_pairs(left, [a for a, _ in views]), _in_pairs(right, [b for _, b in views])
     rows, order = zip(*sides, strict=True)
     by_id = left.point is not None and right.point is not None
     if by_id:
@@ -148,9 +147,13 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
     n_codes = 1 + int(codes.max(initial=0))
     parts = np.split(codes, [len(rows[0])])
     keys = [view * n_codes + code for view, code in zip(order, parts, strict=True)]
-    if not by_id:  # no view has an id twice
-        for points, row, key in zip((left, right), rows, keys, strict=True):
-            _refuse_repeated(points, row, key)
+    for points, row, key in zip((left, right), rows, keys, strict=True):
+        if (repeat := first_repeat(key, np.full(len(key), ""))) is not None:  # no view has an id twice
+            later, first = (points.place(int(row[k])) for k in repeat)
+            raise InputError(
+                f"{later}: the point is at the same X, Y, Z (in the same view) as {first}; remove one of the "
+                "rows, or give a column point with an id of each point in both files"
+            )
     common, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
     if not common.size or (not by_id and len(common) < _LEAST_COMMON * min(map(len, rows))):
         what, few = "id" if by_id else "X, Y, Z", f"{len(common)} points" if common.size else "no point"
@@ -170,19 +173,6 @@ def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.int
     pair = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
     rows = np.flatnonzero(pair >= 0)
     return rows, pair[rows]
-
-
-def _refuse_repeated(points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp]) -> None:
-    order = np.argsort(keys, kind="stable")
-    repeated = np.flatnonzero(np.diff(keys[order]) == 0)
-    if not repeated.size:
-        return
-    first, second = sorted(int(rows[order[repeated[0] + k]]) for k in (0, 1))
-    raise InputError(
-        f"{points.place(second)}: the point is at the same X, Y, Z (in the same view) as "
-        f"{points.place(first)}; remove one of the rows, or give a column point with an id of each point in "
-        "both files"
-    )
 
 
 @frozen_dataclass(eq=False)
@@ -235,7 +225,7 @@ def connected_frames(points: Mapping[str, Correspondences]) -> FrameNames:
         check_one_target(points)
     else:
         pair_points(left, right, pairs)
-    return frames_of_pairs(left.view_names, right.view_names, pairs.both)
+    return frames_of_pairs(left.view_names, right.view_names, pairs)
 
 
 def frames_of_pairs(
@@ -252,7 +242,7 @@ def frames_of_pairs(
 def _of_other_planes(left: Correspondences, right: Correspondences, pairs: ViewPairs) -> bool:
     """Whether pairs of views show other planes of a target, whose ids name them, so no point in common."""
     planes = []
-    for one, names in zip((left, right), zip(*pairs.both, strict=True), strict=True):
+    for one, names in zip((left, right), zip(*pairs, strict=True), strict=True):
         if one.point is None:
             return False
         paired = np.isin(one.view_names, names)[one.view_index]

@@ -14,7 +14,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.presented import Presented
-from neurocal_cli.calibration.rig.frames import pair_views
+from neurocal_cli.calibration.rig.frames import pair_views, unpaired
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.camera.late_import import late
@@ -138,11 +138,7 @@ class StereoRig(FixedCameras):
     @property
     def alone(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Views of the left camera alone and of the right camera alone."""
-        both = [*self.pairs, *self.left_out]
-        return (
-            tuple(name for name in self.left.views if name not in {a for a, _ in both}),
-            tuple(name for name in self.right.views if name not in {b for _, b in both}),
-        )
+        return unpaired(self.left.views, self.right.views, [*self.pairs, *self.left_out])
 
     @property
     def baseline(self) -> float:
@@ -321,7 +317,7 @@ class Rig(FixedCameras):
         if not (left and right):
             return {}
         first = self.first
-        return {(a, b): self.left_out[first, a] for a, b in pair_views(left, right).both}
+        return {(a, b): self.left_out[first, a] for a, b in pair_views(left, right)}
 
     def _relative_covariance(self, names: tuple[str, str], pose: Pose) -> Array:
         """(6, 6) covariance of the angles and the translation from one camera to another."""

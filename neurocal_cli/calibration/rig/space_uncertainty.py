@@ -16,7 +16,7 @@ from neurocal_cli.adjustment.cross_validation import inverse_or_nan
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
 from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given
-from neurocal_cli.calibration.rig.frames import ViewPairs, pair_points
+from neurocal_cli.calibration.rig.frames import pair_points
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
 from neurocal_cli.calibration.rig.triangulation import triangulate
@@ -143,7 +143,7 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     if not pairs:
         return np.zeros(0), np.zeros(0)
     try:
-        rows = pair_points(*sides, ViewPairs(pairs))
+        rows = pair_points(*sides, pairs)
     except InputError:  # views of different parts of the target
         return np.zeros(0), np.zeros(0)
     step = max(1, len(rows.left) // _MOST_POINTS)

@@ -29,7 +29,7 @@ Points = tuple[Correspondences, Correspondences]
 
 def made(points: Points, distortion: str = "none", skew: bool = False) -> tuple[RigProblem, RelativePoses]:
     cameras = [calibrate(side, distortion=distortion, skew=skew) for side in points]
-    problem = stereo_problem(*cameras, pair_views(points[0].view_names, points[1].view_names).both)
+    problem = stereo_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
     poses = relative_poses(problem, find_consensus(problem).rig)
     assert poses is not None
     return problem, poses

@@ -220,7 +220,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     scene = flat("wide", 4, 7)
     points = sides(scene, 1e-5)
     cameras = [calibrate(p, skew=False) for p in points]
-    problem = stereo_problem(*cameras, pair_views(points[0].view_names, points[1].view_names).both)
+    problem = stereo_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
     state = problem.start([scene.rig])
     columns = state.columns
     free = np.ones(columns.n_shared, dtype=bool)

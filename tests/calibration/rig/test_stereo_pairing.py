@@ -8,7 +8,7 @@ import pytest
 from support.rigs import random_rig
 
 from neurocal_cli import Correspondences
-from neurocal_cli.calibration.rig.frames import ViewPairs, check_one_target, pair_points, pair_views
+from neurocal_cli.calibration.rig.frames import check_one_target, pair_points, pair_views, unpaired
 from neurocal_cli.errors import InputError
 
 
@@ -28,18 +28,20 @@ from neurocal_cli.errors import InputError
     ],
 )
 def test_names_pair_without_the_word_for_the_side(left: str, right: str) -> None:
-    assert pair_views([left, "left99"], [right]).both == ((left, right),)
+    assert pair_views([left, "left99"], [right]) == ((left, right),)
 
 
 def test_equal_names_are_the_only_pairs_when_there_are_any() -> None:
-    pairs = pair_views(["a", "left01", "b"], ["b", "right01", "c"])
-    assert pairs == ViewPairs((("b", "b"),), ("a", "left01"), ("right01", "c"))
+    names = ["a", "left01", "b"], ["b", "right01", "c"]
+    assert pair_views(*names) == (("b", "b"),)
+    assert unpaired(*names, pair_views(*names)) == (("a", "left01"), ("right01", "c"))
 
 
 def test_pairs_come_in_the_left_cameras_order() -> None:
-    pairs = pair_views(["left02", "left01", "left03"], ["right01", "right02", "right04"])
-    assert pairs.both == (("left02", "right02"), ("left01", "right01"))
-    assert (pairs.left_only, pairs.right_only) == (("left03",), ("right04",))
+    names = ["left02", "left01", "left03"], ["right01", "right02", "right04"]
+    pairs = pair_views(*names)
+    assert pairs == (("left02", "right02"), ("left01", "right01"))
+    assert unpaired(*names, pairs) == (("left03",), ("right04",))
 
 
 @pytest.mark.parametrize(
@@ -137,6 +139,6 @@ def test_several_points_at_one_place_are_refused() -> None:
 def test_a_capital_after_a_small_letter_names_the_side() -> None:
     for left, right in (("imageL{}", "imageR{}"), ("camLeft{}", "camRight{}"), ("frame{}L", "frame{}R")):
         names = [[side.format(k) for k in range(3)] for side in (left, right)]
-        assert pair_views(*names).both == tuple(zip(*names, strict=True))
+        assert pair_views(*names) == tuple(zip(*names, strict=True))
     with pytest.raises(InputError, match="no view of the left camera has a partner"):
         pair_views(["xL0", "xLa1"], ["xLb0"])

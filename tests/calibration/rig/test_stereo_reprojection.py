@@ -22,7 +22,7 @@ def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigP
     left, right = (scene.points(side, sigma, rng) for side in (0, 1))
     right = right.select(rng.random(len(right)) < 0.8)
     calibrations = [calibrate(p, skew=False, distortion=lens) for p in (left, right)]
-    problem = stereo_problem(*calibrations, pair_views(left.view_names, right.view_names).both)
+    problem = stereo_problem(*calibrations, pair_views(left.view_names, right.view_names))
     return scene, problem, problem.start([find_consensus(problem).rig])
 
 
