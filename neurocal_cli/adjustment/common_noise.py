@@ -156,17 +156,10 @@ def common_share(covariance: Array, residuals: Array, across: Array | None = Non
         return 0.0
     unlikelihood = _unlikelihood(C, r, n)
     low, high = 0.0, 1.0
-    inner = [high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)]
-    values = [unlikelihood(m) for m in inner]
     for _ in range(_STEPS):
-        if values[0] < values[1]:
-            high, inner[1], values[1] = inner[1], inner[0], values[0]
-            inner[0] = high - _GOLDEN * (high - low)
-            values[0] = unlikelihood(inner[0])
-        else:
-            low, inner[0], values[0] = inner[0], inner[1], values[1]
-            inner[1] = low + _GOLDEN * (high - low)
-            values[1] = unlikelihood(inner[1])
+        step = _GOLDEN * (high - low)
+        is_left = unlikelihood(high - step) < unlikelihood(low + step)
+        low, high = (low, low + step) if is_left else (high - step, high)
     best = min((0.0, 0.5 * (low + high), 1.0), key=unlikelihood)
     enough = unlikelihood(best) + 0.5 * _CONTRADICTED**2 / len(r)
     for extreme in (0.0, 1.0):
