@@ -14,7 +14,7 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board import find as find_module
 from neurocal_cli.adjustment.board import posterior as posterior_module
 from neurocal_cli.adjustment.board.find import LEAST_GAIN, evidence_as_given, find_target, sight_of
-from neurocal_cli.adjustment.board.information import Information, folded_information, information_of, joined
+from neurocal_cli.adjustment.board.information import Information, information_by_fold, information_of
 from neurocal_cli.adjustment.board.posterior import (
     evidence_of_given,
     known_sizes,
@@ -135,18 +135,13 @@ def test_the_folds_of_the_views_sum_up_to_all() -> None:
         problem, adjusted = minimum(some)
         _, label, _ = distinct_points([some])
         sight = sight_of(problem, adjusted, label)
-        folded = folded_information([sight], 63, [np.arange(7) % 3])
-        parts = folded.parts(folded.whole, lambda info: info)
-        for k, part in enumerate(parts):
-            own = information_of([sight.of_points(sight.views.index % 3 == k)], 63)
-            blocks = [(part.cameras, own.cameras, field.name) for field in fields(Arrowhead)]
-            blocks += [(part, own, field.name) for field in fields(Information) if field.name != "cameras"]
-            for one, other, name in blocks:
-                a, b = getattr(one, name), getattr(other, name)
-                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0))
+        found, _ = information_by_fold([sight], 63, [np.arange(7) % 3])
         whole = information_of([sight], 63)
-        assert joined(parts).cost == pytest.approx(whole.cost)
-        np.testing.assert_allclose(joined(parts).by_camera, whole.by_camera, rtol=1e-9, atol=1e-6)
+        blocks = [(found.cameras, whole.cameras, field.name) for field in fields(Arrowhead)]
+        blocks += [(found, whole, field.name) for field in fields(Information) if field.name != "cameras"]
+        for one, other, name in blocks:
+            a, b = getattr(one, name), getattr(other, name)
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0))
 
 
 def test_the_posterior_is_that_of_the_whole_dense_system() -> None:

@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    folded_information,
+    information_by_fold,
     information_of,
     of_views,
     steps_of_poses,
@@ -260,21 +260,25 @@ class Search:
             if self.still:
                 here = self._of_held_points()
             else:
-                folded = folded_information(self.sights(), len(self.given), folds if known else None)
-                here = folded.whole.turned(self.prior.axes)
+                sights, n = self.sights(), len(self.given)
+                folded: list[Information] = []
+                if known:
+                    here, folded = information_by_fold(sights, n, folds)
+                else:
+                    here = information_of(sights, n)
+                here = here.turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
             if self.surface is not None:
                 self.precision = most_probable_precision(here, self.prior.size)
             info = here if self.still else here.around_given(self.offsets)
-            info = info if self.surface is None else info.held(self.precision)
+            info = self._with_prior(info)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
             parts: list[WithoutPoses] = []
             if self.still:
                 found = given_posterior(info, self.prior)
             else:
-                if known:
-                    parts = [WithoutPoses(part) for part in folded.parts(info, self._in_offsets)]
+                parts = [WithoutPoses(self._with_prior(self._in_offsets(part))) for part in folded]
                 found = posterior(info, self.prior, self.sizes, self.absent, noise, step == 0, parts)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
@@ -355,6 +359,10 @@ class Search:
     def _in_offsets(self, info: Information) -> Information:
         """The quadratic around the current target, in the whole offsets along each point's axes."""
         return info.turned(self.prior.axes).around_given(self.offsets)
+
+    def _with_prior(self, info: Information) -> Information:
+        """The same with the prior of the bends, if there are any."""
+        return info if self.surface is None else info.held(self.precision)
 
     def sights(self) -> list[Sight]:
         """Observations of each camera for the current target."""

@@ -10,8 +10,7 @@ more columns, for its coefficients, before that of the residual.
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -146,11 +145,6 @@ class Information:
         more = float((bends * by_pose[:, 6:]).sum())
         return replace(self, cameras=self.cameras.around(by_pose, by_shared, more), by_camera=by_camera)
 
-    def with_poses_of(self, other: Information, which: NDArray[np.bool_] | slice) -> Information:
-        """The same sums, with the blocks of some poses (P,) of another."""
-        cameras = replace(self.cameras, own=other.cameras.own[which], cross=other.cameras.cross[which])
-        return replace(self, cameras=cameras, pose_point=other.pose_point[which])
-
     def pose_by(self, offsets: Array) -> Array:
         """(P, p) contribution of offsets (n, 3) to the right side of the poses."""
         P, p = self.pose_point.shape[:2]
@@ -185,64 +179,37 @@ class Information:
         return replace(self, cameras=cameras, by_camera=by_camera)
 
 
-@frozen_dataclass(eq=False)
-class FoldedInformation:
-    """Information of all views, and of each fold of the views."""
-
-    whole: Information
-    sums: list[Information]  # of each fold, without the blocks of its poses
-    fold: NDArray[np.intp]  # (P,) of each pose
-
-    def parts(self, whole: Information, change: Callable[[Information], Information]) -> list[Information]:
-        """Information of each fold after a change; that of all views has been changed already."""
-        return [change(some).with_poses_of(whole, self.fold == k) for k, some in enumerate(self.sums)]
-
-
 def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     """Sum over the observations of all cameras; each camera has its own free parameters and poses."""
-    return folded_information(sights, n_points).whole
-
-
-def folded_information(
-    sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]] | None = None
-) -> FoldedInformation:
-    """The same, and the sums over each fold; `folds` (V,) are the folds of each camera's views, from 0."""
-    folds = folds or [np.zeros(sight.views.n_views, dtype=np.intp) for sight in sights]
-    n_folds = 1 + max(int(fold.max()) for fold in folds)
     widths = [int(sight.free.sum()) for sight in sights]
     poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
-    f, P = sum(widths), sum(poses)
-    p = len(sights[0].own_columns)
-    found = Information(  # the sums have one more axis, for the folds
-        Arrowhead(np.zeros((n_folds, f + 1, f + 1)), np.zeros((P, p, p)), np.zeros((P, p, f + 1))),
-        np.zeros((n_folds, n_points, 3, 3)), np.zeros((n_folds, n_points, 3, f + 1)),
-        np.zeros((P, p, n_points, 3)), 0.0,
+    f, P, p = sum(widths), sum(poses), len(sights[0].own_columns)
+    found = Information(
+        Arrowhead(np.zeros((f + 1, f + 1)), np.zeros((P, p, p)), np.zeros((P, p, f + 1))),
+        np.zeros((n_points, 3, 3)), np.zeros((n_points, 3, f + 1)), np.zeros((P, p, n_points, 3)),
+        sum(sight.views.n_equations for sight in sights if sight.views.n_views),
     )  # fmt: skip
-    equations, of_poses = np.zeros(n_folds), []
     ends = zip(np.cumsum(widths).tolist(), np.cumsum(poses).tolist(), strict=True)
-    for sight, of_views, width, count, (end, last) in zip(sights, folds, widths, poses, ends, strict=True):
-        _add(found, sight, slice(end - width, end), slice(last - count, last), of_views)
-        equations += np.bincount(of_views, sight.views.equations, n_folds)
-        of_poses.append(of_views[:count])
-    fold = np.concatenate(of_poses)
+    for sight, width, count, (end, last) in zip(sights, widths, poses, ends, strict=True):
+        if sight.views.n_views:
+            _add(found, sight, slice(end - width, end), slice(last - count, last))
     bends = [sight.bends for sight in sights if sight.bends is not None]
+    return found.around_straight(np.concatenate(bends)) if bends else found
 
-    def sums(taken: Callable[[Array], Any], of: NDArray[np.bool_] | slice) -> Information:
-        info = replace(
-            found,
-            cameras=replace(found.cameras, shared=taken(found.cameras.shared)),
-            point=taken(found.point),
-            by_camera=taken(found.by_camera),
-            equations=float(taken(equations)),
-        ).with_poses_of(found, of)
-        return info.around_straight(np.concatenate(bends)[of]) if bends else info
 
-    whole = sums(lambda values: values.sum(axis=0), slice(None))
-    of_folds = []
-    for k in range(n_folds):
-        own = fold == k if bends else slice(0)  # bends add products with the blocks of poses to the sums
-        of_folds.append(sums(operator.itemgetter(k), own).with_poses_of(found, slice(0)))
-    return FoldedInformation(whole, of_folds, fold)
+def information_by_fold(
+    sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]]
+) -> tuple[Information, list[Information]]:
+    """The same, and that of each fold of the views; `folds` (V,) are those of each camera's views, from 0."""
+    parts = []
+    for k in range(1 + max(int(fold.max()) for fold in folds)):
+        own = [
+            sight.of_points((fold == k)[sight.views.index]) for sight, fold in zip(sights, folds, strict=True)
+        ]
+        parts.append(information_of(own, n_points))
+    of_poses = [fold[: len(fold) * sight.free_poses] for sight, fold in zip(sights, folds, strict=True)]
+    order = np.argsort(np.argsort(np.concatenate(of_poses), kind="stable"))
+    return joined(parts, order), parts
 
 
 def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
@@ -252,8 +219,8 @@ def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Arr
     return np.asarray(np.linalg.solve(info.cameras.own, right[..., None])[..., 0])
 
 
-def joined(parts: Sequence[Information]) -> Information:
-    """Sum over parts of the views of the same cameras."""
+def joined(parts: Sequence[Information], order: NDArray[np.intp] | slice = slice(None)) -> Information:
+    """Sum over parts of the views of the same cameras, with the poses in this order."""
 
     def total(name: str) -> Any:
         return sum(getattr(part, name) for part in parts)
@@ -261,8 +228,8 @@ def joined(parts: Sequence[Information]) -> Information:
     arrows = [part.cameras for part in parts]
     shared, own, cross = ([getattr(one, name) for one in arrows] for name in ("shared", "own", "cross"))
     return Information(
-        Arrowhead(np.sum(shared, axis=0), np.concatenate(own), np.concatenate(cross)),
-        total("point"), total("by_camera"), np.concatenate([part.pose_point for part in parts]),
+        Arrowhead(np.sum(shared, axis=0), np.concatenate(own)[order], np.concatenate(cross)[order]),
+        total("point"), total("by_camera"), np.concatenate([part.pose_point for part in parts])[order],
         total("equations"), total("log_precision"),
     )  # fmt: skip
 
@@ -272,20 +239,17 @@ def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
     return (joined([part for part in parts if part is not out]) for out in parts)
 
 
-def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> None:
-    """Add the observations of one camera to the sums of the folds (V,) of its views."""
-    views, columns, of_pose, (n_folds, n_points) = (
-        sight.views, sight.columns, sight.own_columns, found.point.shape[:2],
-    )  # fmt: skip
+def _add(found: Information, sight: Sight, own: slice, poses: slice) -> None:
+    """Add the observations of one camera."""
+    views, columns, of_pose = sight.views, sight.columns, sight.own_columns
     # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
-    cross = (
-        found.pose_point[poses] if sight.free_poses else np.zeros((views.n_views, len(of_pose), n_points, 3))
-    )
-    normal, summed = _terms(sight, cross, fold, n_folds)
+    cross = found.pose_point[poses]
+    if not sight.free_poses:
+        cross = np.zeros((views.n_views, len(of_pose), len(found.point), 3))
+    normal, summed = _terms(sight, cross)
     px2 = views.pixel_scale**2
-    by_fold = px2 * np.stack([normal[fold == k].sum(axis=0) for k in range(n_folds)])
     kept, place = np.append(columns, normal.shape[1] - 1), np.append(np.arange(own.start, own.stop), -1)
-    found.cameras.shared[:, place[:, None], place] += by_fold[:, kept[:, None], kept]
+    found.cameras.shared[place[:, None], place] += px2 * normal.sum(axis=0)[kept[:, None], kept]
     found.point[...] += px2 * summed[..., :3]
     found.by_camera[..., own] += px2 * summed[..., 3:-1]  # slices are faster than indices
     found.by_camera[..., -1] += px2 * summed[..., -1]
@@ -296,8 +260,8 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArr
         cross *= px2
 
 
-def _terms(sight: Sight, cross: Array, fold: NDArray[np.intp], n_folds: int) -> tuple[Array, Array]:
-    """Normal matrices (V, w, w) of one camera's views, and sums by fold and point (F, n, 3, f + 4).
+def _terms(sight: Sight, cross: Array) -> tuple[Array, Array]:
+    """Normal matrices (V, w, w) of one camera's views, and sums over each point (n, 3, f + 4).
 
     The sums are products of the derivatives by the points with these, those by the camera's free parameters
     and the residuals, all normalised. `cross` (V, p, n, 3) are zeros that become those with the views' own
@@ -310,7 +274,7 @@ def _terms(sight: Sight, cross: Array, fold: NDArray[np.intp], n_folds: int) -> 
     twice = (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)
     once = len(label) == len(cross) and not twice.any()  # each view is one batch, in which no point is twice
     alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
-    summed = np.zeros((n_folds, n_points, 3, len(kept) + 3))
+    summed = np.zeros((n_points, 3, len(kept) + 3))
     for chunk, part, by_point in sight.linearised(label[:1] if alike else label):
         view, seen = batches.view[chunk], label[chunk]
         products(part, by_batch[chunk])
@@ -319,17 +283,12 @@ def _terms(sight: Sight, cross: Array, fold: NDArray[np.intp], n_folds: int) -> 
         if alike:
             own, rows = by_point.transpose(3, 1, 0, 2), rows.transpose(3, 0, 2, 1)
             n = len(own)
-            for k in range(n_folds):
-                of = fold[view] == k if n_folds > 1 else slice(None)
-                summed[k, seen[0]] += own[:, :, of].reshape(n, 3, -1) @ rows[:, of].reshape(
-                    n, -1, len(kept) + 3
-                )
+            summed[seen[0]] += own.reshape(n, 3, -1) @ rows.reshape(n, -1, len(kept) + 3)
             cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
             continue
         real = seen >= 0
         every, flat = np.moveaxis(_of_each(by_point, rows), 3, 1)[real], seen[real]
-        place = (fold[view][:, None] * n_points + seen)[real]
-        summed += _summed_by(place, every.reshape(len(flat), -1), n_folds * n_points).reshape(summed.shape)
+        summed += _summed_by(flat, every.reshape(len(flat), -1), n_points).reshape(summed.shape)
         places = np.broadcast_to(view[:, None], real.shape)[real], flat
         each = np.swapaxes(crossed, 1, 2)[real]
         if once:

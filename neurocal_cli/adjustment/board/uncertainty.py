@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    folded_information,
+    information_by_fold,
     information_of,
     joined_without_each,
 )
@@ -76,11 +76,9 @@ def covariance_basis(
         n_poses = int(group.max()) + 1
         if n_poses > _MOST_POSES:
             return None
-        folded = folded_information([sight], n, [group])
-        whole = in_offsets(folded.whole)
+        parts = [in_offsets(part) for part in information_by_fold([sight], n, [group])[1]]
         if target.bends is not None:
-            whole = whole.held(variance / target.bends.size**2)
-        parts = folded.parts(whole, in_offsets)
+            parts = [part.held(variance / target.bends.size**2) for part in parts]
         try:
             if target.only_bends:
                 return np.stack([camera_step_of(rest) for rest in joined_without_each(parts)])
