@@ -268,7 +268,8 @@ def other_kind(images: Iterable[NDArray[np.generic]], described: Plane) -> str:
         plane = _agreed(seen).plane
     except NoBoardError as error:
         return "" if seen.kind is seen.squares else str(error)
-    if found_words(plane) == found_words(replace(described, markers=plane.markers)):
+    same = replace(described, square=plane.square, markers=plane.markers)
+    if (plane.markers is None) == (described.markers is None) and found_words(plane) == found_words(same):
         return ""
     return f"the image shows {found_words(plane)}; correct the description of the board, or leave it out"
 

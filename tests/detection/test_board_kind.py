@@ -76,12 +76,17 @@ def test_grids_of_circles_are_found(form: str) -> None:
     assert (kind_of(found.plane), found.plane.cols, found.plane.rows) == (kind_of(true), true.cols, true.rows)
 
 
-def test_light_and_dark_may_be_exchanged() -> None:
-    plane = plane_of("charuco:6x5:40:30:DICT_4X4_50")
+@pytest.mark.parametrize(
+    ("form", "seed", "psf"),
+    # Of the second, the square around each marker looks like a marker, too.
+    [("charuco:6x5:40:30:DICT_4X4_50", 2, 0.8), ("charuco:6x5:40:32:DICT_6X6_250", 1, 1.2)],
+)
+def test_light_and_dark_may_be_exchanged(form: str, seed: int, psf: float) -> None:
+    plane = plane_of(form)
     assert plane.markers is not None
     plane = replace(plane, markers=replace(plane.markers, inverted=True))
-    scene = marked_scene(plane, 2, square=30.0)
-    picture = taken(scene, 2, 4)
+    scene = marked_scene(plane, seed, square=30.0, psf=psf)
+    picture = taken(scene, seed, 4)
     found = found_board([picture.image]).plane
     assert found.markers is not None
     assert (found.markers.inverted, found.cols, found.rows) == (True, 5, 4)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from support.command_line import run
+from support.marked import plane_of
 from support.places import SAMPLES
 
 from neurocal_cli.detection.board_kind import other_kind
@@ -36,6 +37,12 @@ def markers(kind: str) -> np.ndarray:
     return board.generateImage((1000, 750), marginSize=60)
 
 
+def grid_of_squares() -> np.ndarray:
+    squares = (np.indices((6, 8)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    image = np.kron(squares, np.ones((100, 100), dtype=np.uint8))
+    return photographed(np.pad(image, ((75, 75), (100, 100)), constant_values=255))
+
+
 def circles(staggered: bool, light: bool = False) -> np.ndarray:
     image = np.full((750, 1000), 20 if light else 255, dtype=np.uint8)
     step, radius = (40, 18) if staggered else (80, 26)
@@ -56,6 +63,14 @@ def circles(staggered: bool, light: bool = False) -> np.ndarray:
 )
 def test_markers_are_recognised(kind: str, said: str) -> None:
     assert said in other_kind([photographed(markers(kind))], DESCRIBED)
+
+
+def test_markers_in_the_squares_make_another_kind() -> None:
+    with_markers, plain = plane_of("charuco:8x6:30:22"), plane_of("chessboard:7x5:30")
+    charuco, chessboard = photographed(markers("charuco")), grid_of_squares()
+    assert "the image shows a ChArUco board of 8 x 6 squares" in other_kind([charuco], plain)
+    assert other_kind([charuco], with_markers) == ""
+    assert "the image shows a chessboard of 7 x 5 inner vertices" in other_kind([chessboard], with_markers)
 
 
 @pytest.mark.parametrize(("staggered", "light"), [(False, False), (True, False), (True, True)])

@@ -45,6 +45,7 @@ _LONGEST = 2200  # px; larger images are halved first, which still shows the mar
 SMALL, _ENLARGED = 1000, 3.0  # px; smaller images are enlarged by a factor if markers cannot be read
 _WINDOWS = (5, 29, 8)  # px; least and greatest window of the adaptive threshold, and its step
 _SMALLEST = 6.0  # px, least side of a marker
+_APART = 0.02  # of its perimeter; of two nearer quadrangles, one is left out
 
 
 @frozen_dataclass(eq=False)
@@ -162,6 +163,8 @@ def _detector(dictionary: str, first: int, count: int, border: int):  # type: ig
     least, most, step = _WINDOWS
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least, most
     parameters.adaptiveThreshWinSizeStep = step
+    # A marker is not left out because the square around it looks like one, too.
+    parameters.minMarkerDistanceRate = _APART
     # More is allowed than by default, which helps with small markers; false ones do not fit the board.
     parameters.polygonalApproxAccuracyRate = 0.06
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
