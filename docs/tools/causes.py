@@ -14,10 +14,11 @@ HEAD = "| cause | what the data look like | shared by | advice |\n| --- | --- | 
 
 
 def table() -> str:
-    """One row for each cause of a camera and of a rig, and for each of its looks."""
+    """One row for each cause of a camera, of its rows and of a rig, and for each of its looks."""
     sys.path[:0] = [str(ROOT)]
     from neurocal_cli.calibration.rig.causes import CAUSES
     from neurocal_cli.calibration.verdict import effects
+    from neurocal_cli.calibration.verdict.mistakes import MISTAKES
     from neurocal_cli.calibration.verdict.rivals import RIVALS
 
     shared = {
@@ -28,6 +29,7 @@ def table() -> str:
         None: "no views: each has its own",
     }
     rows = [(one, shared[one.patterns]) for one in RIVALS]
+    rows += [(one, "one view, or all") for one in MISTAKES]
     rows += [(one, f"{'all cameras' if one.of_all else 'a camera'} of a rig") for one in CAUSES]
     told = dict.fromkeys(f"| {one.cause} | {one.looks} | {who} | {one.advice} |\n" for one, who in rows)
     return HEAD + "".join(told)

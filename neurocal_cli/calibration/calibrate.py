@@ -254,18 +254,10 @@ def _explained(error: DegenerateGeometryError, points: Correspondences, type: in
 
 def _true_cause(points: Correspondences, type: int) -> str:
     """Why points are refused, if it is another cause than what the refusal says; else ""."""
-    from neurocal_cli.calibration.verdict.what_is_given import (
-        MEASURE_AXES,
-        exchanged_rows,
-        proportions,
-        unlike_axes,
-    )
+    from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
+    from neurocal_cli.calibration.verdict.what_is_given import unlike_axes
 
-    exchanged = exchanged_rows(points)
-    if exchanged:
-        return exchanged
-    found = proportions(points) if type in (1, 2) else None
-    return "" if found is None else f"{unlike_axes(found)}; {MEASURE_AXES}"
+    return "; ".join(mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None) or ())
 
 
 def _angle_of(skew: bool | str, square_pixels: bool, method: str, distortion: str) -> str:

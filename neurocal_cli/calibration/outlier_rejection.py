@@ -33,9 +33,10 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.other_causes import contradicts_sigma, error_of_view, odd_view, why_odd
+from neurocal_cli.calibration.other_causes import contradicts_sigma, odd_view
 from neurocal_cli.calibration.point_errors import FLOOR, PointErrors, largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import MISFIT, TOLD, pixel_spread
+from neurocal_cli.calibration.verdict.mistakes import error_of_view, why_odd
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.consensus import (
@@ -331,4 +332,4 @@ def _rejected(points: Correspondences, kept: _Kept, solution: Solution) -> Rejec
     if not rows.size:
         return Rejected(views=reasons)
     error = point_errors(solution, points).length[rows]
-    return Rejected(points.select(rows), np.where(np.isfinite(error), error, np.nan), reasons)
+    return Rejected(points.select(rows), np.where(np.isfinite(error), error, np.nan), reasons, rows)

@@ -54,10 +54,11 @@ from neurocal_cli.calibration.verdict.measures import (
     pixel_covariance,
     projection_uncertainty,
 )
+from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
+from neurocal_cli.calibration.verdict.odd_points import OUTLIERS, repeated_views, with_rejected
 from neurocal_cli.calibration.verdict.rules import reach_verdict
-from neurocal_cli.calibration.verdict.what_is_given import Proportions, hidden_centre, proportions
+from neurocal_cli.calibration.verdict.what_is_given import hidden_centre, unlike_axes
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion
@@ -258,7 +259,7 @@ class _AtMinimum:
                 *noise_shape(self.points, residuals, alike),
             ),
             stated=bool(stated),
-            proportions=self._proportions(contradiction),
+            mistake=self._mistake(contradiction),
         )
 
     def _residuals(self) -> Array:
@@ -353,11 +354,15 @@ class _AtMinimum:
         views = self.views if target is None else self._arranged(points)
         return hidden_centre(self.calibration, points, views, self.given, self.repeated.worth)
 
-    def _proportions(self, contradiction: float) -> Proportions | None:
+    def _mistake(self, contradiction: float) -> tuple[str, str] | None:
+        """A mistake in all views, and what to do, if they contradict each other or lost points."""
+        found, lost = None, self.calibration.rejected.points
+        if lost is not None and OUTLIERS.grade(len(lost) / (len(lost) + len(self.points))):
+            found = mistake_in_all_views(with_rejected(self.calibration))
         given = self.calibration.target is None and self.calibration.type in (1, 2)
-        if not given or self._is_exact() or not contradiction > CONTRADICTION.good:
-            return None
-        return proportions(self.points)
+        if found or not given or self._is_exact() or not contradiction > CONTRADICTION.good:
+            return found
+        return unlike_axes(self.points)
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:

@@ -30,7 +30,6 @@ from neurocal_cli.observations.points import Correspondences
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.verdict.contest import Contest
-    from neurocal_cli.calibration.verdict.what_is_given import Proportions
 
 _ACROSS = 21  # points across the image
 # The image circle of a wide lens is assumed to reach this times the angle of the farthest point, and at least
@@ -215,4 +214,4 @@ class Evidence:
     stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
     poses: int  # number of different poses among the views (`repeated_poses`)
     contest: Contest | None  # the causes of the residuals
-    proportions: Proportions | None  # of a board whose axes have different units
+    mistake: tuple[str, str] | None  # in the rows of all views, and what to do

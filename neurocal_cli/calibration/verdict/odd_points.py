@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.findings import FEW_POINTS, TOLD, Finding, Limit, name_some
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
+from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.points import Correspondences
 
 # Clipped: at least this number of points, and this share, have exactly the same outermost coordinate.
@@ -37,15 +38,17 @@ _UNITS = {
     304.8: "feet and millimetres",
     12.0: "feet and inches",
 }
-_OUTLIERS = Limit(0.02, 0.2)  # of the points, and of those of a view that is named; clean views lose none
+OUTLIERS = Limit(0.02, 0.2)
+"""Limits of the share of outliers, of all points and of those of a view; clean views lose none."""
 _FEWEST_OUTLIERS = 4  # fewest outliers of a view, or views of a point
 _OF_A_POINT = 0.6  # share of its views in which a target point must be an outlier to be named
+_ON_A_POINT = 0.1  # of the distance of points: as far as two places may differ that are the same
 
 
 def odd_points(calibration: Calibration, explained: bool) -> Iterator[Finding]:
     """All findings about the points of a calibration, outliers included.
 
-    `explained` tells whether a cause that all views share explains the outliers.
+    `explained` tells whether a cause or a mistake that all views share explains the outliers.
     """
     points = with_rejected(calibration)
     yield from _rejected_points(calibration, explained)
@@ -267,15 +270,17 @@ def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.b
 
 
 def with_rejected(calibration: Calibration) -> Correspondences:
-    """All given points, outliers included: world points and pixels by view."""
-    kept, lost = calibration.points, calibration.rejected.points
+    """All given points, outliers included, in their order if it is known: world points and pixels by view."""
+    kept, lost, rows = calibration.points, calibration.rejected.points, calibration.rejected.rows
     if lost is None:
         return kept
+    n = len(kept) + len(lost)
+    order = np.arange(n) if rows is None else np.argsort(np.append(np.delete(np.arange(n), rows), rows))
     names = [np.array(part.view_names)[part.view_index] for part in (kept, lost)]
     return Correspondences(
-        np.concatenate([kept.world, lost.world]),
-        np.concatenate([kept.pixels, lost.pixels]),
-        np.concatenate(names),
+        np.concatenate([kept.world, lost.world])[order],
+        np.concatenate([kept.pixels, lost.pixels])[order],
+        np.concatenate(names)[order],
         kept.image_size,
     )
 
@@ -289,10 +294,10 @@ def _rejected_points(calibration: Calibration, explained: bool) -> Iterator[Find
     total = len(calibration.points) + len(lost)
     if explained:
         text = f"{len(lost)} of {total} points are outliers because of it, and were left out"
-        yield _OUTLIERS.grade(len(lost) / total), text, ""
+        yield OUTLIERS.grade(len(lost) / total), text, ""
         return
     views = _of_views(calibration, lost)
-    targets = _of_targets(calibration.points, lost, set(rejected.views))
+    targets = _of_targets(calibration, lost, set(rejected.views))
     where = [f"{name} ({why})" for name, why in list(rejected.views.items())[:2]]
     if len(rejected.views) > 2:
         where.append(f"{len(rejected.views) - 2} more views")
@@ -303,7 +308,7 @@ def _rejected_points(calibration: Calibration, explained: bool) -> Iterator[Find
         where.append(f"{name_some(targets)} in most views")
         advice = "check X,Y,Z of the points that are outliers in most views"
     yield (
-        max(_OUTLIERS.grade(len(lost) / total), int(bool(where))),
+        max(OUTLIERS.grade(len(lost) / total), int(bool(where))),
         f"{len(lost)} of {total} points are outliers and were left out"
         + (": " if where else "")
         + "; ".join(where),
@@ -320,22 +325,50 @@ def _of_views(calibration: Calibration, lost: Correspondences) -> dict[str, int]
     return {
         name: count
         for name, count in counts.items()
-        if name in kept and count >= _FEWEST_OUTLIERS and count > _OUTLIERS.poor * (count + kept[name])
+        if name in kept and count >= _FEWEST_OUTLIERS and count > OUTLIERS.poor * (count + kept[name])
     }
 
 
-def _of_targets(kept: Correspondences, lost: Correspondences, wrong_views: set[str]) -> list[str]:
-    """Points of the target that are outliers in most of the views that show them."""
-    here = np.array([name not in wrong_views for name in lost.view_names])[lost.view_index]
+def _of_targets(calibration: Calibration, lost: Correspondences, wrong_views: set[str]) -> list[str]:
+    """Points of the target that are outliers in most of the views that show them, and where they are seen."""
+    kept, here = calibration.points, np.array([name not in wrong_views for name in lost.view_names])
     if not here.any():
         return []
-    lost = lost.select(here)
-    keys, place = np.unique(np.concatenate([lost.world, kept.world]), axis=0, return_inverse=True)
+    lost = lost.select(here[lost.view_index])
+    world = np.concatenate([lost.world, kept.world])
+    keys, place = np.unique(world, axis=0, return_inverse=True)
     place = place.reshape(-1)
     n_lost = np.bincount(place[: len(lost)], minlength=len(keys))
     n_seen = np.bincount(place, minlength=len(keys))
-    found = np.flatnonzero((n_seen >= _FEWEST_OUTLIERS) & (n_lost > _OF_A_POINT * n_seen))
-    if lost.point is None:
-        return [f"the point ({', '.join(f'{x:g}' for x in keys[k])})" for k in found]
-    names = dict(zip(place[: len(lost)].tolist(), np.asarray(lost.point).tolist(), strict=True))
-    return [f"point {names[k]}" for k in found.tolist()]
+    found = np.flatnonzero((n_seen >= _FEWEST_OUTLIERS) & (n_lost > _OF_A_POINT * n_seen)).tolist()
+    of_point = [f"the point ({_numbers(key)})" for key in keys]
+    if lost.point is not None and kept.point is not None:
+        ids = np.concatenate([lost.point, kept.point])
+        of_point = [f"point {ids[k]}" for k in np.unique(place, return_index=True)[1].tolist()]
+    if not found or not is_flat(keys):
+        return [of_point[k] for k in found]
+    seen, near = _on_target(calibration, lost, keys), _ON_A_POINT * _steps([keys])[0, 0]
+    told = []
+    for k in found:
+        at = np.array([median(x) for x in seen[place[: len(lost)] == k].T])
+        away = np.linalg.norm(keys - at, axis=1)
+        off = median(np.linalg.norm(seen[place[: len(lost)] == k] - at, axis=1))
+        where = of_point[int(away.argmin())] if away.min() < near else _numbers(at)
+        told.append(of_point[k] + (f" (seen at {where})" if off < near else ""))
+    return told
+
+
+def _numbers(values: Array) -> str:
+    return ", ".join(f"{float(f'{x:.4g}'):g}" for x in values.tolist())
+
+
+def _on_target(calibration: Calibration, points: Correspondences, target: Array) -> Array:
+    """(N, 3) where the rays of the pixels meet the plane of a flat target (M, 3)."""
+    centre = target.mean(axis=0)
+    normal = np.linalg.svd(target - centre)[2][2]
+    state, rays = calibration.state(points.view_names), calibration.camera.unproject(points.pixels)
+    back = np.swapaxes(state.R, 1, 2)[points.view_index]
+    origin = -(back @ state.t[points.view_index][..., None])[..., 0]
+    along = (back @ rays[..., None])[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(origin + ((centre - origin) @ normal / (along @ normal))[:, None] * along)

@@ -39,7 +39,6 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.calibration.verdict.measures import Evidence
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
-from neurocal_cli.calibration.verdict.what_is_given import MEASURE_AXES, unlike_axes
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import MISPRINT, Target
@@ -87,10 +86,9 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     if are_normalised(calibration.points.pixels):  # the other rules are in pixels
         yield from odd_pixels(calibration.points)
         return
-    axes = evidence.proportions
-    if axes is not None:  # the axes of the board explain what would be taken for another cause
+    if evidence.mistake is not None:  # it explains what would be taken for another cause
+        yield 2, evidence.mistake[0], evidence.mistake[1]
         evidence = replace(evidence, contest=None)
-        yield 2, unlike_axes(axes), MEASURE_AXES
     if not calibration.converged:
         named = not calibration.lens_choice and calibration.distortion_model != "none"
         slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
@@ -186,7 +184,7 @@ def _is_common_noise(e: Evidence) -> bool:
 
 def _unexplained(calibration: Calibration, e: Evidence) -> str:
     """What is said of the cause, if no known one explains the error."""
-    if e.proportions or e.stated or (_explains(calibration, e) and not _is_unknown(e)):
+    if e.mistake or e.stated or (_explains(calibration, e) and not _is_unknown(e)):
         return ""
     nearest = closest(e.contest, calibration)
     return f", and no known cause explains it{f'; closest: {nearest}' if nearest else ''}"
@@ -210,7 +208,9 @@ def _is_unknown(e: Evidence) -> bool:
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    yield from odd_points(calibration, e.contest is not None and e.contest.of_outliers)
+    yield from odd_points(
+        calibration, e.mistake is not None or (e.contest is not None and e.contest.of_outliers)
+    )
     yield from e.noise
     if e.repeated:
         twice = "the rows are given twice, in the view itself or in another one"

@@ -1,4 +1,4 @@
-"""Test whether what is given is wrong: the axes of a flat board, its rows and columns, or an image centre.
+"""Test whether what is given is wrong: the axes of a flat board, or an image centre.
 
 `proportions` tests whether the two axes have different units, or the squares are not square.
 
@@ -11,10 +11,6 @@ board whose first axis is multiplied by s fulfil
 which is linear in omega for a given s. A camera is fitted to the board with the s whose equations have the
 smallest residual, and the rival of a stretched target refines it. It is the cause if the camera then fits
 nearly as well as a separate camera for each view, and far better than with the coordinates as they are given.
-
-`exchanged_rows` tests whether the numbers of rows and columns were exchanged, so that rows end too late. The
-points of a view are then those of a grid with as many columns as it should have rows, in the same order. A
-homography maps the right grid to the pixels, but for distortion, and no homography maps the wrong one.
 
 `hidden_centre` tests a given centre. The poses absorb a wrong centre, and tangential distortion or the shape
 of the target the rest, so the error hardly grows and no cause is open. Therefore the camera is fitted with a
@@ -43,8 +39,7 @@ from neurocal_cli.calibration.verdict.rival import causes_among
 from neurocal_cli.calibration.verdict.rivals import CHANGED, SAME, SHAPES
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, median
-from neurocal_cli.camera.homographies import homographies, homography_at
+from neurocal_cli.camera.homographies import homographies
 from neurocal_cli.camera.pinhole import omega_of, product_of
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
@@ -132,9 +127,7 @@ _FEWEST_VIEWS, _FEWEST_POINTS = 4, 6  # one view more than the unknowns need
 _ENOUGH_VIEWS, _STARTS = 40, 20
 _AWAY = 0.02  # least difference from 1; prints are less off, and boards of such small errors fit
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
-_GRID_FITS = 0.03  # rms error of a homography over the spread of the pixels; lenses leave less
-_GRID_BETTER = 5.0  # times smaller than the error with the rows as given
-MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
+_MEASURE = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
 
 
 @frozen_dataclass
@@ -178,14 +171,18 @@ def proportions(points: Correspondences) -> Proportions | None:
     )
 
 
-def unlike_axes(found: Proportions) -> str:
-    """The reason for a verdict, or for a refusal."""
+def unlike_axes(points: Correspondences) -> tuple[str, str] | None:
+    """The proportions with which a flat board fits, and what to do; None if it fits as given, or never."""
+    found = proportions(points)
+    if found is None:
+        return None
     units, axis = units_mixed(found.factor), found.axis
     instead = f" instead of {found.given_px:.3g}" if np.isfinite(found.given_px) else ""
     return (
         f"the points fit a board whose {axis} is {float(f'{found.factor:.3g}'):g} times as long as given "
         f"({found.rmse_px:.3g} px rms{instead}): {axis} and {found.other} have "
-        f"different units{units}, or its squares are not square"
+        f"different units{units}, or its squares are not square",
+        _MEASURE,
     )
 
 
@@ -253,47 +250,3 @@ def _is_noise(solution: Solution) -> bool:
     views, cost = solution.problem.views, float(solution.adjusted.cost.sum())
     variance = cost / max(views.n_equations - 7 - 6 * views.n_views, 1)
     return variance < CONTRADICTION.good**2 * variance_of_views(views, solution.state)
-
-
-def exchanged_rows(points: Correspondences) -> str:
-    """Say that rows and columns are exchanged, if a grid with them exchanged fits; "" otherwise."""
-    sides = [np.unique(points.world[:, axis]) for axis in range(3)]
-    axes = [axis for axis in range(3) if len(sides[axis]) > 1]
-    if len(axes) != 2:
-        return ""
-    first = points.world[points.view_index == 0]
-    # The axis that changes more often from point to point runs along the rows.
-    slow, fast = sorted(axes, key=lambda axis: np.count_nonzero(np.diff(first[:, axis])))
-    columns, rows = len(sides[fast]), len(sides[slow])
-    if columns == rows:
-        return ""
-    column, row = (np.searchsorted(sides[axis], points.world[:, axis]) for axis in (fast, slow))
-    place = row * columns + column
-    as_given, exchanged = np.column_stack([column, row]), np.column_stack([place % rows, place // rows])
-    counts = np.bincount(points.view_index)
-    some = np.flatnonzero(counts >= _FEWEST_POINTS)[:_ENOUGH_VIEWS]
-    if not some.size:
-        return ""
-    members = [points.view_index == view for view in some]
-    given, other = (
-        median(np.array([_misfit(grid[one].astype(float), points.pixels[one]) for one in members]))
-        for grid in (as_given, exchanged)
-    )
-    if not (other < _GRID_FITS and other * _GRID_BETTER < given):
-        return ""
-    return (
-        f"the points fit a board of {rows} columns and {columns} rows, but are given with {columns} columns "
-        f"and {rows} rows: rows and columns are exchanged; exchange --cols and --rows, or the numbers in "
-        "the file"
-    )
-
-
-def _misfit(grid: Array, pixels: Array) -> float:
-    """Rms error of a homography over the spread of the pixels."""
-    spread = float(np.sqrt(pixels.var(axis=0).sum()))
-    if not (spread > 0 and (grid.std(axis=0) > 0).all()):
-        return np.inf
-    scaled = (pixels - pixels.mean(axis=0)) / spread
-    off = homography_at(homographies(grid[None], scaled[None]), grid[None])[0] - scaled
-    rms = float(np.sqrt((off**2).sum(axis=1).mean()))
-    return rms if np.isfinite(rms) else np.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -105,7 +106,14 @@ def test_outliers_are_named_by_what_they_have_in_common() -> None:
     verdict = calibrate(moved(POINTS, world)).verdict
     assert verdict is not None
     assert verdict.word == "usable"
-    assert verdict.reasons == ("10 of 930 points are outliers and were left out: point p40 in most views",)
+    (reason,) = verdict.reasons
+    told = (
+        r"10 of 930 points are outliers and were left out: point p40 \(seen at (.*), (.*), 0\) in most views"
+    )
+    found = re.fullmatch(told, reason)
+    assert found is not None, reason
+    right = POINTS.world[40, :2]
+    assert np.hypot(*(np.array(found.groups(), dtype=float) - right)) < 0.2
 
 
 def test_a_view_that_is_left_out_with_its_cause_lies_outside_nothing() -> None:
