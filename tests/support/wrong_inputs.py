@@ -307,7 +307,7 @@ FLAT: dict[str, Spoiler] = {
     "image size turned": lambda p, rng: replace(p, image_size=(480, 640)),
     "half of the points shifted by a square": lambda p, rng: shifted(p, range(10)),
     "half of the points of one view shifted by a square": lambda p, rng: shifted(p, [6]),
-    "board bent by 4 mm": lambda p, rng: bent_board(p, 4.0),
+    "board bent by 4 mm, kept as given": lambda p, rng: Input(bent_board(p, 4.0), {"target": "given"}),
     "Z full of noise": lambda p, rng: moved(
         p, world=p.world + np.array([0, 0, 4.0]) * np.tile(rng.normal(size=(len(board()), 1)), (10, 1))
     ),
@@ -466,7 +466,7 @@ CAUSES: dict[str, str] = {
     "image size turned": "width and height",
     "half of the points shifted by a square": "outliers",
     "half of the points of one view shifted by a square": "in view06",
-    "board bent by 4 mm": "it seems bent by",
+    "board bent by 4 mm, kept as given": "it seems bent by",
     "Z full of noise": "X,Y,Z",
     "half of the pixels anywhere": "of the points are outliers",
     "a fifth of the pixels anywhere": "of 930 points are outliers",
@@ -579,7 +579,7 @@ SLOW = frozenset(
         "Z full of noise",
         "a fifth of the pixels anywhere",
         "all views alike",
-        "board bent by 4 mm",
+        "board bent by 4 mm, kept as given",
         "boards all parallel",
         "boards in a corner of the image only",
         "columns and rows swapped in reading",
