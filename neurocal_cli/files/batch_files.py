@@ -264,20 +264,23 @@ def fingerprints(folder: str, inputs: Sequence[str], known: Mapping[str, Any]) -
     """
     found: dict[str, dict[str, Any]] = {}
     for name in inputs:
-        path, former = os.path.normpath(os.path.join(folder, name)), known.get(name, {})
         try:
-            status = os.stat(path)
-            seen: dict[str, Any] = {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
-            same = former.get("sha256") and all(former.get(key) == value for key, value in seen.items())
-            found[name] = seen | {"sha256": former["sha256"] if same else _sha256(path)}
+            seen, former = _seen(folder, name), known.get(name, {})
+            same = former.get("sha256") and seen.items() <= former.items()
+            found[name] = seen | {"sha256": former["sha256"] if same else _sha256(folder, name)}
         except OSError:
             found[name] = {"sha256": ""}
     return found
 
 
-def _sha256(path: str) -> str:
+def _seen(folder: str, name: str) -> dict[str, Any]:
+    status = os.stat(os.path.normpath(os.path.join(folder, name)))
+    return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
+
+
+def _sha256(folder: str, name: str) -> str:
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
+    with open(os.path.normpath(os.path.join(folder, name)), "rb") as file:
         while block := file.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
@@ -301,13 +304,9 @@ def read_record(results: str) -> dict[str, Any]:
 def unread_since(folder: str, inputs: Mapping[str, Mapping[str, Any]]) -> bool:
     """Whether size and time of change of all input files are still those of a record."""
     try:
-        for name, entry in inputs.items():
-            status = os.stat(os.path.normpath(os.path.join(folder, name)))
-            if (status.st_size, status.st_mtime_ns) != (entry["size"], entry["mtime_ns"]):
-                return False
-    except (OSError, KeyError, TypeError):
+        return all(_seen(folder, name).items() <= entry.items() for name, entry in inputs.items())
+    except (OSError, AttributeError):
         return False
-    return True
 
 
 def sizes_of(folder: str) -> dict[str, int]:

@@ -36,18 +36,9 @@ OPTIONAL = {
 _SETTINGS = ("zoom", "focus")
 # Names of columns in use elsewhere, in lower case without punctuation.
 _WORLD = (
-    "{0}world",
-    "world{0}",
-    "{0}w",
-    "obj{0}",
-    "object{0}",
-    "objloc{0}",
-    "{0}3d",
-    "{0}object",
-    "{0}mm",
-    "{0}cm",
-    "{0}m",
-)
+    "{0}world", "world{0}", "{0}w", "obj{0}", "object{0}", "objloc{0}", "{0}3d", "{0}object", "{0}mm",
+    "{0}cm", "{0}m",
+)  # fmt: skip
 _IMAGE = (
     "imgloc{1}", "img{1}", "image{1}", "pixel{1}", "{1}pixel", "{1}img", "{1}image", "{0}pixel", "pixel{0}",
     "{0}px", "{1}px", "{1}2d",

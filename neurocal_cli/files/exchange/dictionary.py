@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -138,13 +137,9 @@ def json_text(tree: Mapping[str, Any]) -> str:
 
 
 def npz_bytes(tree: Mapping[str, Any]) -> bytes:
-    """Write the dictionary for ``numpy.load``, without the time stamps of ``numpy.savez``."""
+    """Write the dictionary for ``numpy.load``; the same dictionary gives the same bytes."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for key, value in tree.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{key}.npy"), member.getvalue())
+    np.savez(buffer, **tree)
     return buffer.getvalue()
 
 
