@@ -257,12 +257,9 @@ def _owners(tables: list[Table], views: list[NDArray[Any]]) -> dict[str, str]:
     """Find the file of each view."""
     owners: dict[str, str] = {}
     for table, labels in zip(tables, views, strict=True):
-        first_of_run = np.concatenate([[True], labels[1:] != labels[:-1]])
-        mine: dict[str, int] = {}
-        for first in np.flatnonzero(first_of_run).tolist():
-            mine.setdefault(str(labels[first]), first)
-        for name, row in mine.items():
+        for name in dict.fromkeys(labels.tolist()):
             if name in owners:
+                row = int(np.argmax(labels == name))
                 raise InputError(
                     f"{table.source}:{table.lines[row]}: the view {name[:60]!r} is also in {owners[name]}; "
                     "give each view of the camera a name of its own"

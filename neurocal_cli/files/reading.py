@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import IO
 
-from neurocal_cli.errors import FormatError, NeurocalError, one_line, reading_failures
+from neurocal_cli.errors import FormatError, one_line, reading_failures
 from neurocal_cli.files.writing import held_back
 
 _IMAGES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")  # how PNG, JPEG, BMP and TIFF begin
@@ -24,6 +24,7 @@ _WIDE_MARKS = (
     (b"\xff\xfe", "UTF-16"),
     (b"\xfe\xff", "UTF-16"),
 )
+_STDIN = "<stdin>"
 # All of stdin within `repeatable_stdin`.
 _KEPT: ContextVar[bytes | None] = ContextVar("stdin", default=None)
 
@@ -40,58 +41,60 @@ def repeatable_stdin() -> Iterator[None]:
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
     """Read a whole file, or stdin for ``-``, and its name for messages."""
-    if str(path) == "-":
-        with _stdin_failures():
-            return _stdin().read(), "<stdin>"
-    source = one_line(path)
-    with reading_failures(source), open(path, "rb") as file:
-        _protect(file)
-        return file.read(), source
+    with _opened(path) as (file, source):
+        return _read(file, source), source
 
 
 def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
     """Read a file in blocks of whole lines of about `size` bytes; without line ends it is one block."""
-    if str(path) == "-":
-        with _stdin_failures():
-            yield from _whole_lines(_stdin(), size)
-        return
-    with reading_failures(one_line(path)):
-        file = open(path, "rb")  # noqa: SIM115 - errors of the caller must not count as reading failures
-    _protect(file)
-    with file:
-        blocks = _whole_lines(file, size)
-        while True:
-            with reading_failures(one_line(path)):
-                block = next(blocks, None)
-            if block is None:
-                return
-            yield block
-
-
-def _stdin() -> IO[bytes]:
-    """Stdin, or what was kept of it; the current command may not overwrite its file."""
-    if outputs := held_back():
-        outputs.protect("-")
-    kept = _KEPT.get()
-    return sys.stdin.buffer if kept is None else io.BytesIO(kept)
-
-
-def _protect(file: IO[bytes]) -> None:
-    """Prevent the current command from overwriting a file that it reads."""
-    if outputs := held_back():
-        outputs.protect_status(os.fstat(file.fileno()))
-
-
-def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
     rest: list[bytes] = []
-    while block := file.read(size):
-        end = block.rfind(b"\n") + 1
-        if end:
-            yield b"".join([*rest, block[:end]])
-            rest = []
-        rest.append(block[end:])
+    with _opened(path) as (file, source):
+        while block := _read(file, source, size):
+            end = block.rfind(b"\n") + 1
+            if end:
+                yield b"".join([*rest, block[:end]])
+                rest = []
+            rest.append(block[end:])
     if any(rest):
         yield b"".join(rest)
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], str]]:
+    """A file, or stdin or what was kept of it, and its name; the current command may not overwrite it."""
+    outputs = held_back()
+    if str(path) == "-":
+        if outputs:
+            outputs.protect("-")
+        kept = _KEPT.get()
+        with _failures(_STDIN):
+            file = sys.stdin.buffer if kept is None else io.BytesIO(kept)
+        yield file, _STDIN
+        return
+    source = one_line(path)
+    with _failures(source):
+        opened = open(path, "rb")  # noqa: SIM115 - errors of the caller must not count as reading failures
+    with opened:
+        if outputs:
+            outputs.protect_status(os.fstat(opened.fileno()))
+        yield opened, source
+
+
+def _read(file: IO[bytes], source: str, size: int = -1) -> bytes:
+    with _failures(source):
+        return file.read(size)
+
+
+@contextmanager
+def _failures(source: str) -> Iterator[None]:
+    if source != _STDIN:
+        with reading_failures(source):
+            yield
+        return
+    try:
+        yield
+    except (AttributeError, ValueError, OSError) as error:  # stdin is absent or closed
+        raise FormatError("stdin cannot be read; give a file", source) from error
 
 
 def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
@@ -138,13 +141,3 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         raise FormatError(
             f"byte 0x{data[error.start]:02x} is not UTF-8 text; save the file as UTF-8", source, line
         ) from error
-
-
-@contextmanager
-def _stdin_failures() -> Iterator[None]:
-    try:
-        yield
-    except NeurocalError:  # raised by the caller
-        raise
-    except (AttributeError, ValueError, OSError) as error:  # stdin is absent or closed
-        raise FormatError("stdin cannot be read; give a file", "<stdin>") from error

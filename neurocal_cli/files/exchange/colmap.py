@@ -159,8 +159,6 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
     reader = {"cameras": cameras, "images": images, "rigs": rigs}[name]
     try:
         (count,) = take("Q")
-        if count > len(data):
-            raise ValueError
         rows = [(k, [str(word) for word in reader()]) for k in range(1, count + 1)]
         if place != len(data):
             raise ValueError
