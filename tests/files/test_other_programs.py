@@ -522,6 +522,19 @@ def test_cameras_with_rotation_vectors_are_a_rig(listed: bool, tmp_path: Path) -
     assert np.abs(found.relative[0].to_camera(first) - second).max() < 1e-9
 
 
+@pytest.mark.parametrize("names", [("a", "b"), ("left", "right")])
+def test_cameras_that_each_have_rotation_and_translation_are_a_rig(
+    names: tuple[str, str], tmp_path: Path
+) -> None:
+    """As in the Panoptic data set; none of them is taken for the one camera, nor for a pose between two."""
+    one = {"K": json.loads(K), "distCoef": FIVE, "R": np.eye(3).tolist()}
+    tree = {name: {**one, "t": [[float(k)], [0], [5]]} for k, name in enumerate(names)}
+    (tmp_path / "rig.json").write_text(json.dumps(tree))
+    found = read_cameras([tmp_path / "rig.json"])
+    assert tuple(camera.name for camera in found.cameras) == names
+    assert found.relative[0].t.tolist() == [1, 0, 0]
+
+
 def test_a_stereo_script_of_bouguet_is_a_rig(tmp_path: Path) -> None:
     lines = ["% Stereo", "nx = 640; ny = 480;"]
     for side in ("left", "right"):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from neurocal_cli.files.camera_tree import matrix_data, storage_text
 from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, is_matrix, plain_lists
 from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import Format, PoseKeys
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.exchange.tree_paths import arrays
@@ -165,10 +165,10 @@ def is_part(document: Document) -> bool:
 
 def _parts(document: Document) -> dict[str, Field]:
     """One camera or two of a dictionary under our keys, or those in it that have poses of their own."""
-    found = _holders(plain_lists(document.root.value), {}, document.source)
-    if posed := _posed(found, document):
+    root = Field(plain_lists(document.root.value), document.source)
+    if posed := _posed(root, document):
         return posed
-    root = _one_of(found, document)
+    root = _within(root, document.notes)
     keys = LooseKeys(root, document.distortion, document.notes)
     sides = _sides(keys)
     if sides is None:
@@ -190,17 +190,12 @@ def _parts(document: Document) -> dict[str, Field]:
         if R is None or t is None:
             raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
         trees[0] |= zip(_PLACED.paths, 2 * [[0.0, 0.0, 0.0]], strict=True)
-        trees[1] |= _pose_of(R, t, 9)
+        pose = matrix_data(R, 9).tolist(), matrix_data(t, 3).tolist()
+        trees[1] |= zip(_PLACED.paths, pose, strict=True)
     if document.is_script:
         document.warnings.append(f"{document.source}: {FROM_ZERO}")
     trees[0] |= {key: root[key].value for key in (_ROWS, *_VECTORS, _VIEWS, _UNIT) if key in root}
     return {str(k): Field(tree, root.source) for k, tree in enumerate(trees)}
-
-
-def _pose_of(R: Field, t: Field, count: int = -1) -> Tree:
-    return dict(
-        zip(_PLACED.paths, (matrix_data(R, count).tolist(), matrix_data(t, -1).tolist()), strict=True)
-    )
 
 
 def with_sizes_noted(found: CameraSet, parts: Mapping[str, Field], document: Document) -> CameraSet:
@@ -241,48 +236,20 @@ def with_sizes_noted(found: CameraSet, parts: Mapping[str, Field], document: Doc
     return found
 
 
-_Holder = tuple[str, Field, Tree]  # the key of a mapping, the mapping, and what stands around it
-
-
-def _holders(value: Any, around: Tree, source: str, name: str = "", depth: int = _DEEPEST) -> list[_Holder]:
-    """The mappings that hold a camera, or two of a rig, with the other keys of the mappings around them."""
-    if isinstance(value, dict):
-        _refuse_stacked(value)
-        root = Field(_sides_apart(value), source, name)
-        if _has_camera(Field({**around, **root.value}, source)):
-            return [(name, root, around)]
-    found = []
-    named = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, part in named if depth else ():
-        if isinstance(part, (dict, list)):
-            beside = around | _beside(value, str(key)) if isinstance(value, dict) else around
-            found += _holders(part, beside, source, str(key), depth - 1)
-    return found
-
-
-def _has_camera(root: Field) -> bool:
-    keys = LooseKeys(root)
-    return keys.has_camera() or _sides(keys) is not None or any(map(keys.has_camera, "12lr"))
-
-
-def _beside(tree: Tree, name: str) -> Tree:
-    """The other keys of a mapping, those of a camera without its name: color_distortion and color_camera."""
-    own = next((word for word in PARAMETERS if plain(name).endswith(word) and len(word) > 2), "")
-    stem = plain(name).removesuffix(own) if own else ""
-    return {
-        plain(key).removeprefix(stem) if stem and plain(key).startswith(stem) else key: entry
-        for key, entry in tree.items()
-        if key != name
-    }
-
-
-def _posed(found: Sequence[_Holder], document: Document) -> dict[str, Field]:
-    """Several cameras, each with its rotation vector and translation as OpenCV has them.
+def _posed(root: Field, document: Document) -> dict[str, Field]:
+    """Cameras in a list or a mapping, each with its rotation vector and translation as OpenCV has them.
 
     Those of the Panoptic data set have R and t, from the world as well.
     """
-    trees: dict[str, Field] = {}
-    for key, part, around in found if len(found) > 1 else ():
+    value = root.value.get("cameras", root.value) if isinstance(root.value, dict) else root.value
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    found = [
+        (str(name), Field(part, root.source, str(name)))
+        for name, part in parts
+        if isinstance(part, dict) and LooseKeys(Field(part, "")).has_camera()
+    ]
+    trees = {}
+    for name, part in found if len(found) > 1 else ():
         keys = LooseKeys(part, document.distortion, document.notes)
         r, t = keys.find("rvec"), keys.find("tvec")
         if "distCoef" in part and "R" in part:
@@ -290,37 +257,57 @@ def _posed(found: Sequence[_Holder], document: Document) -> dict[str, Field]:
         if r is None or t is None:
             return {}
         stated = part.get("name").value
-        name = stated if isinstance(stated, str) else key
-        unit = {} if trees else {_UNIT: around.get(_UNIT)}
-        tree = {**keys.tree(), **_pose_of(r, t), "camera_name": name, **unit}
+        pose = dict(zip(_PLACED.paths, (matrix_data(one, -1).tolist() for one in (r, t)), strict=True))
+        tree = {**keys.tree(), **pose, "camera_name": stated if isinstance(stated, str) else name}
         keys.refuse_unread()
-        trees[key] = Field(tree, document.source, key)
+        trees[name] = Field(tree, root.source, name)
+    if trees and isinstance(root.value, dict):
+        next(iter(trees.values())).value[_UNIT] = root.get(_UNIT).value
     return trees
 
 
-def _one_of(found: Sequence[_Holder], document: Document) -> Field:
-    """The mapping that holds the camera, with the keys around it; all may hold the same one."""
-    root = document.root if not found else Field({**found[0][2], **found[0][1].value}, document.source)
+def _within(root: Field, notes: list[str]) -> Field:
+    """The mapping that holds the camera: the root, or the only one in it that does, with the other keys."""
+    others: dict[str, Any] = {}
+    for _ in range(_DEEPEST):
+        value = root.value
+        if isinstance(value, dict):
+            _refuse_stacked(value)
+            root = Field({**others, **_sides_apart(value)}, root.source)
+            keys = LooseKeys(root)
+            if keys.has_camera() or _sides(keys) is not None or any(map(keys.has_camera, "12lr")):
+                break
+        elif not isinstance(value, list):
+            raise NoCameraError(UNKNOWN)
+        named = value.items() if isinstance(value, dict) else enumerate(value)
+        parts = {str(name): part for name, part in named if _holds_camera(part)}
+        if not parts:
+            break
+        name, part = next(iter(parts.items()))
+        if len(parts) > 1:
+            cameras = [_camera_of(part) for part in parts.values()]
+            if None in cameras or any(camera != cameras[0] for camera in cameras):
+                names = ", ".join(key[:20] for key in list(parts)[:9])
+                raise InputError(
+                    f"holds several cameras ({names}), and their relative poses in no form that is known; "
+                    "save the keys of one camera as a file"
+                )
+            notes.append(f"{root.source}: holds the same camera {len(parts)} times")
+        if isinstance(value, dict):
+            # color_distortion belongs to color_intrinsics.
+            own = next((word for word in PARAMETERS if plain(name).endswith(word) and len(word) > 2), "")
+            stem = plain(name).removesuffix(own) if own else ""
+            others |= {
+                plain(str(key)).removeprefix(stem)
+                if stem and plain(str(key)).startswith(stem)
+                else key: entry
+                for key, entry in value.items()
+                if str(key) != name
+            }
+        root = Field(part, root.source)
     if not isinstance(root.value, dict):
         raise NoCameraError(UNKNOWN)
-    if len(found) > 1:
-        if not _are_same([part for _, part, _ in found]):
-            names = ", ".join(key[:20] for key, *_ in found[:9])
-            raise InputError(
-                f"holds several cameras ({names}), and their relative poses in no form that is known; "
-                "save the keys of one camera as a file"
-            )
-        document.notes.append(f"{root.source}: holds the same camera {len(found)} times")
     return root
-
-
-def _are_same(parts: Iterable[Field]) -> bool:
-    """Whether cameras are alike in all that they say but their names; False if one cannot be read."""
-    try:
-        first, *others = ({**LooseKeys(part).tree(), "camera_name": ""} for part in parts)
-    except NeurocalError:
-        return False
-    return all(other == first for other in others)
 
 
 def _refuse_stacked(tree: Mapping[str, Any]) -> None:
@@ -343,16 +330,31 @@ def _sides_apart(tree: dict[str, Any]) -> dict[str, Any]:
     names = {plain(str(key)): key for key, part in tree.items()}
     if names.keys().isdisjoint(NAMES["T"]):
         return tree
-    names = {
-        name: key
-        for name, key in names.items()
-        if isinstance(tree[key], dict) and _has_camera(Field(tree[key], ""))
-    }
+    names = {name: key for name, key in names.items() if _holds_camera(tree[key], 0)}
     for pair in _SIDES:
         if set(pair) <= set(names):
             apart = {f"{key}_{side}": value for side in pair for key, value in tree[names[side]].items()}
             return {**{key: value for key, value in tree.items() if key not in names.values()}, **apart}
     return tree
+
+
+def _holds_camera(tree: Any, depth: int = _DEEPEST) -> bool:
+    if isinstance(tree, list):
+        return depth > 0 and any(_holds_camera(part, depth - 1) for part in tree if isinstance(part, dict))
+    if not isinstance(tree, dict):
+        return False
+    keys = LooseKeys(Field(tree, ""))
+    if keys.has_camera() or _sides(keys) is not None:
+        return True
+    return depth > 0 and any(_holds_camera(part, depth - 1) for part in tree.values())
+
+
+def _camera_of(tree: Any) -> dict[str, Any] | None:
+    """All that a camera says but its name; None if it cannot be read."""
+    try:
+        return {**LooseKeys(_within(Field(tree, ""), [])).tree(), "camera_name": ""}
+    except NeurocalError:
+        return None
 
 
 def _sides(keys: LooseKeys) -> tuple[str, str] | None:
