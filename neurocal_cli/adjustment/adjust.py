@@ -139,14 +139,10 @@ class _Reprojection:
         """Steps of the cameras and the poses, and their predicted gains."""
         if not self.together:
             return self._solve_apart(self.normal, damping, active)
-        if not self.free_pose:
-            (by_camera, _), promised = self._solve_apart(
-                self.normal.sum(axis=0, keepdims=True), damping, active
-            )
-            return (by_camera, np.zeros((self.batches.n_views, 6))), promised
-        step, by_pose, gain = Arrowhead.of(self.normal, self.shared, POSE_COLUMNS).step(float(damping[0]))
-        by_camera = np.zeros((1, len(self.camera)))
-        by_camera[0, self.free] = step
+        own = POSE_COLUMNS if self.free_pose else POSE_COLUMNS[:0]
+        step, by_own, gain = Arrowhead.of(self.normal, self.shared, own).step(float(damping[0]))
+        by_camera, by_pose = np.zeros((1, len(self.camera))), np.zeros((self.batches.n_views, 6))
+        by_camera[0, self.free], by_pose[:, : len(own)] = step, by_own
         return (by_camera, by_pose), np.array([gain])
 
     def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:

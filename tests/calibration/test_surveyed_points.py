@@ -14,12 +14,11 @@ from support.slow_cases import slow_but
 from support.surveyed import K, surveyed
 
 from neurocal_cli import calibrate, read_calibration, read_points
-from neurocal_cli.adjustment.board import posterior as posterior_module
+from neurocal_cli.adjustment.board import system as system_module
 from neurocal_cli.adjustment.board.find import sight_of
 from neurocal_cli.adjustment.board.information import Information, information_of
 from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import Prior, surveyed_prior
-from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
@@ -60,8 +59,8 @@ def test_the_covariances_are_those_of_the_whole_dense_system(monkeypatch: pytest
         H[at, at] = info.point[k] + 0.09 * np.diag((2 * prior.stated[k]) ** -2)
     inverse = np.linalg.inv(np.tril(H) + np.tril(H, -1).T)
 
-    for solved_by in (PointsFirst, PosesFirst):
-        monkeypatch.setattr(posterior_module, "system_of", solved_by)
+    for points_first in (True, False):
+        monkeypatch.setattr(system_module, "points_first", lambda *_, first=points_first: first)
         found = known_sizes(info, prior, {"stated": 2.0}, 0.09)
         np.testing.assert_allclose(found.camera, inverse[c, c], rtol=1e-6)
         np.testing.assert_allclose(found.std.ravel(), 0.3 * np.sqrt(np.diagonal(inverse)[d]), rtol=1e-6)

@@ -245,28 +245,21 @@ class Search:
 
     def _descended(
         self, least_gain: float, least: float
-    ) -> tuple[Posterior, Information, list[WithoutPoses], list[CameraState]] | None:
+    ) -> tuple[Posterior, Information, Callable[[], list[WithoutPoses]], list[CameraState]] | None:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large.
 
-        Returns the last step's posterior, its quadratic, the parts by fold, and predicted states in pixels.
+        Returns the last step's posterior, its quadratic, the same by folds, and predicted states in pixels.
         """
         noise: float | None = None
         last = 0.0
-        n_views = [problem.views.n_views for problem, _ in self.fits]
-        folds = folds_of(n_views)
         for step in range(_STEPS):
             # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
+            by_fold = partial(self._by_fold, sights := self.sights(), self.offsets)
             if self.still:
                 here = self._of_held_points()
             else:
-                sights, n = self.sights(), len(self.given)
-                folded: list[Information] = []
-                if known:
-                    here, folded = information_by_fold(sights, n, folds)
-                else:
-                    here = information_of(sights, n)
-                here = here.turned(self.prior.axes)
+                here = information_of(sights, len(self.given)).turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
             if self.surface is not None:
                 self.precision = most_probable_precision(here, self.prior.size)
@@ -274,12 +267,10 @@ class Search:
             info = self._with_prior(info)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
-            parts: list[WithoutPoses] = []
             if self.still:
                 found = given_posterior(info, self.prior)
             else:
-                parts = [WithoutPoses(self._with_prior(self._in_offsets(part))) for part in folded]
-                found = posterior(info, self.prior, self.sizes, self.absent, noise, step == 0, parts)
+                found = posterior(info, self.prior, self.sizes, self.absent, noise, step == 0)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             if known and found.evidence < least - _NOT_YET:
@@ -297,13 +288,13 @@ class Search:
                 break
             self._place(states)
         assert states is not None
-        return found, info, parts, states
+        return found, info, by_fold, states
 
     def _accepted(
         self,
         found: Posterior,
         info: Information,
-        parts: list[WithoutPoses],
+        by_fold: Callable[[], list[WithoutPoses]],
         states: list[CameraState],
         least_gain: float,
         least: float,
@@ -318,7 +309,7 @@ class Search:
             return None
         if self.surface is not None and not bends_are_valid(self.sights()[0], self.bends, self.precision):
             return None
-        if not (self.still or passes_cross_validation(parts, self.prior, found.sizes, found.variance)):
+        if not (self.still or passes_cross_validation(by_fold(), self.prior, found.sizes, found.variance)):
             return None
         given, bends = without, None
         if self.surface is not None:
@@ -359,6 +350,13 @@ class Search:
     def _in_offsets(self, info: Information) -> Information:
         """The quadratic around the current target, in the whole offsets along each point's axes."""
         return info.turned(self.prior.axes).around_given(self.offsets)
+
+    def _by_fold(self, sights: Sequence[Sight], offsets: Array) -> list[WithoutPoses]:
+        """The quadratic in the whole offsets of each fold of the views, at a target with these offsets."""
+        folds = folds_of([sight.views.n_views for sight in sights])
+        parts = information_by_fold(sights, len(self.given), folds)
+        parts = [part.turned(self.prior.axes).around_given(offsets) for part in parts]
+        return [WithoutPoses(self._with_prior(part)) for part in parts]
 
     def _with_prior(self, info: Information) -> Information:
         """The same with the prior of the bends, if there are any."""

@@ -199,17 +199,15 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
 
 def information_by_fold(
     sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]]
-) -> tuple[Information, list[Information]]:
-    """The same, and that of each fold of the views; `folds` (V,) are those of each camera's views, from 0."""
+) -> list[Information]:
+    """The same for each fold of the views; `folds` (V,) are those of each camera's views, from 0."""
     parts = []
     for k in range(1 + max(int(fold.max()) for fold in folds)):
         own = [
             sight.of_points((fold == k)[sight.views.index]) for sight, fold in zip(sights, folds, strict=True)
         ]
         parts.append(information_of(own, n_points))
-    of_poses = [fold[: len(fold) * sight.free_poses] for sight, fold in zip(sights, folds, strict=True)]
-    order = np.argsort(np.argsort(np.concatenate(of_poses), kind="stable"))
-    return joined(parts, order), parts
+    return parts
 
 
 def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
@@ -219,8 +217,8 @@ def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Arr
     return np.asarray(np.linalg.solve(info.cameras.own, right[..., None])[..., 0])
 
 
-def joined(parts: Sequence[Information], order: NDArray[np.intp] | slice = slice(None)) -> Information:
-    """Sum over parts of the views of the same cameras, with the poses in this order."""
+def joined(parts: Sequence[Information]) -> Information:
+    """Sum over parts of the views of the same cameras."""
 
     def total(name: str) -> Any:
         return sum(getattr(part, name) for part in parts)
@@ -228,15 +226,10 @@ def joined(parts: Sequence[Information], order: NDArray[np.intp] | slice = slice
     arrows = [part.cameras for part in parts]
     shared, own, cross = ([getattr(one, name) for one in arrows] for name in ("shared", "own", "cross"))
     return Information(
-        Arrowhead(np.sum(shared, axis=0), np.concatenate(own)[order], np.concatenate(cross)[order]),
-        total("point"), total("by_camera"), np.concatenate([part.pose_point for part in parts])[order],
+        Arrowhead(np.sum(shared, axis=0), np.concatenate(own), np.concatenate(cross)),
+        total("point"), total("by_camera"), np.concatenate([part.pose_point for part in parts]),
         total("equations"), total("log_precision"),
     )  # fmt: skip
-
-
-def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
-    """Sums over all parts but one, for each part left out."""
-    return (joined([part for part in parts if part is not out]) for out in parts)
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice) -> None:

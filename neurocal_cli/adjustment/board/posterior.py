@@ -22,7 +22,7 @@ The evidence, with the noise variance marginalised as well, decides whether ther
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,6 @@ from neurocal_cli.adjustment.board.system import (
     PointsFirst,
     PosesFirst,
     Solved,
-    WithoutPoses,
     system_of,
 )
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
@@ -188,17 +187,16 @@ def posterior(
     absent: Collection[str] = (),
     variance: float | None = None,
     with_stretch: bool = True,
-    parts: Sequence[WithoutPoses] = (),
 ) -> Posterior:
     """Estimate the sizes of the parts, and the offsets.
 
     The quadratic is in the whole offsets from the given target, along each point's axes. With initial sizes
     [world unit], an initial noise variance [px^2] is needed as well, because then the errors on the given
     target are no noise. Parts that are named as absent stay absent, and `with_stretch` means that stretch and
-    lean may be switched on or off. The `parts` are those of different views, if they are known already.
-    Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
+    lean may be switched on or off. Raises `numpy.linalg.LinAlgError` if the points do not determine the
+    cameras.
     """
-    system = system_of(info, prior, parts)
+    system = system_of(info, prior)
     climb = _Climb(info, prior, system, absent, _NO_GAIN_YET if sizes is None else _NO_GAIN)
     noise = math.sqrt(info.cost / info.spare if variance is None else variance)
     if sizes is not None:
@@ -246,11 +244,11 @@ def posterior_of(target: Target, info: Information, prior: Prior, variance: floa
 
 
 def minimum_of(
-    info: Information, prior: Prior, sizes: Mapping[str, float], variance: float
+    system: PosesFirst | PointsFirst, sizes: Mapping[str, float], variance: float
 ) -> tuple[Array, Array]:
     """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances."""
     noise = math.sqrt(variance)
-    solved = system_of(info, prior).solve({name: size / noise for name, size in sizes.items()})
+    solved = system.solve({name: size / noise for name, size in sizes.items()})
     return solved.camera_step, solved.offsets()
 
 

@@ -272,20 +272,6 @@ class Coordinates:
         """(k,) variances for given sizes of the parts."""
         return np.asarray(self.units @ self.prior.as_array(sizes) ** 2)
 
-    def precision(self, sizes: Mapping[str, float]) -> Array:
-        """(3 n, 3 n) inverse of the prior covariance of the offsets, by the formula of Woodbury."""
-        first, B, variances = self.linear.shape[1], self.linear, self.variances(sizes)
-        own = 1.0 / variances[first:]
-        if self.vectors is None:
-            found = np.diag(own)
-        else:
-            found = np.zeros((len(own), len(own)))
-            for axis in range(3):
-                found[axis::3, axis::3] = (self.vectors * own[axis::3]) @ self.vectors.T
-        by_linear = found @ B
-        inner = np.diag(1.0 / variances[:first]) + B.T @ by_linear
-        return np.asarray(found - by_linear @ np.linalg.solve(inner, by_linear.T))
-
 
 @lru_cache(maxsize=4)  # one calibration asks for them four times
 def coordinates_of(prior: Prior) -> Coordinates:

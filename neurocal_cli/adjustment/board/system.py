@@ -10,7 +10,7 @@ the work grows linearly with the number of views or of points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache, cached_property
 from itertools import product
 
@@ -138,16 +138,12 @@ class JointCovariance:
         )
 
 
-def system_of(
-    info: Information, prior: Prior, parts: Sequence[WithoutPoses] = ()
-) -> PosesFirst | PointsFirst:
-    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster.
-
-    The parts are those of different views, if they are known already.
-    """
+def system_of(info: Information, prior: Prior) -> PosesFirst | PointsFirst:
+    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster."""
     if points_first(info.cameras.cross[..., -1].size, prior):
         return PointsFirst(info, prior)
-    return PosesFirst(info, prior, parts)
+    whole = WithoutPoses(info)
+    return PosesFirst(info, prior, whole.matrix, whole.logdet)
 
 
 def points_first(of_poses: int, prior: Prior) -> bool:
@@ -159,14 +155,15 @@ def points_first(of_poses: int, prior: Prior) -> bool:
 class PosesFirst:
     """The system with the poses eliminated: cameras and independent coordinates of the offsets.
 
+    `matrix` and `of_poses` are the matrix and the log determinant of `WithoutPoses`.
     Everything independent of the sizes is computed once.
     """
 
-    def __init__(self, info: Information, prior: Prior, parts: Sequence[WithoutPoses] = ()) -> None:
-        parts = parts or [WithoutPoses(info)]
+    def __init__(self, info: Information, prior: Prior, matrix: Array, of_poses: float = 0.0) -> None:
         self.info, self.coordinates, self.f = info, coordinates_of(prior), len(info.cameras.shared) - 1
-        self.of_poses = sum(part.logdet for part in parts)
-        M = self._by_coordinates(self._by_coordinates(np.asarray(sum(part.matrix for part in parts))).T)
+        self.of_poses = of_poses
+        M = self._by_coordinates(self._by_coordinates(matrix).T)
+        _hold_untold(M, self.f)
         self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
 
     def _by_coordinates(self, rows: Array) -> Array:
@@ -230,6 +227,7 @@ class PointsFirst:
         M[: self.f, -1], M[self.f : s, -1] = shared[:-1, -1], across[-1]
         M[s:dim, -1], M[-1, -1] = cross[:, :, -1].reshape(-1), info.cost
         M[-1, :dim] = M[:dim, -1]
+        _hold_untold(M, self.f)
         self.bordered = M
         # (n, 3, s + P p + 1): coupling of each point to all other unknowns and to the right side
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
@@ -276,6 +274,15 @@ class PointsFirst:
             x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet,
             cache(parts), camera.T @ camera, joint,
         )  # fmt: skip
+
+
+def _hold_untold(M: Array, f: int) -> None:
+    """Let those of the f parameters of cameras that no view tells stay as they are.
+
+    Of few views, a camera of several may have none.
+    """
+    untold = np.flatnonzero(np.diagonal(M)[:f] == 0)
+    M[untold, untold] = 1.0
 
 
 def _squared(rows: Array) -> Array:

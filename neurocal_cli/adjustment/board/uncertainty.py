@@ -21,7 +21,7 @@ from neurocal_cli.adjustment.board.information import (
     Sight,
     information_by_fold,
     information_of,
-    joined_without_each,
+    joined,
 )
 from neurocal_cli.adjustment.board.posterior import Posterior, camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
@@ -76,12 +76,14 @@ def covariance_basis(
         n_poses = int(group.max()) + 1
         if n_poses > _MOST_POSES:
             return None
-        parts = [in_offsets(part) for part in information_by_fold([sight], n, [group])[1]]
+        parts = [in_offsets(part) for part in information_by_fold([sight], n, [group])]
         if target.bends is not None:
             parts = [part.held(variance / target.bends.size**2) for part in parts]
         try:
             if target.only_bends:
-                return np.stack([camera_step_of(rest) for rest in joined_without_each(parts)])
+                return np.stack(
+                    [camera_step_of(joined([one for one in parts if one is not out])) for out in parts]
+                )
             without = [WithoutPoses(part) for part in parts]
             return np.stack([step for step, _ in without_each(without, prior, target.sizes, variance)])
         except np.linalg.LinAlgError:

@@ -20,8 +20,7 @@ offsets only together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +28,13 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    joined_without_each,
+    joined,
     of_views,
     without_points,
 )
 from neurocal_cli.adjustment.board.posterior import camera_step, camera_step_of, log_evidence, minimum_of
-from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
-from neurocal_cli.adjustment.board.system import WithoutPoses, points_first
+from neurocal_cli.adjustment.board.prior import Prior
+from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst, WithoutPoses, points_first
 from neurocal_cli.adjustment.cross_validation import least_by_precision
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.camera.geometry import Array
@@ -179,16 +178,6 @@ def passes_cross_validation(
     return bool(alone < 0 or together < 0)
 
 
-def _held(matrix: Array, f: int) -> Array:
-    """A bordered matrix in which those of the f parameters that no view tells stay as they are.
-
-    A camera with fewer views than folds is missing in some of them.
-    """
-    held, untold = matrix.copy(), np.flatnonzero(np.diagonal(matrix)[:f] == 0)
-    held[untold, untold] = 1.0
-    return held
-
-
 def _least(S: Array, g: Array, cost: Array) -> Array:
     """Costs (..., k) minimised over the cameras."""
     return np.asarray(cost - (g * camera_step(S, g)).sum(axis=-2))
@@ -203,19 +192,11 @@ def without_each(
     `variance` [px^2] is that of the noise. Raises `numpy.linalg.LinAlgError` if the other parts do not
     determine the cameras.
     """
-    f = len(parts[0].info.cameras.shared) - 1
+    systems: Iterator[PosesFirst | PointsFirst]
     if points_first(sum(part.info.cameras.cross[..., -1].size for part in parts), prior):
-        estimated = []
-        for some in joined_without_each([part.info for part in parts]):
-            cameras = replace(some.cameras, shared=_held(some.cameras.shared, f))
-            estimated.append(minimum_of(replace(some, cameras=cameras), prior, sizes, variance))
-        return estimated
-    matrices = [part.matrix for part in parts]
-    whole = np.asarray(sum(matrices))
-    whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
-    estimated = []
-    for out in matrices:
-        M = _held(whole - out, f)
-        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
-        estimated.append((x[:f], x[f:].reshape(-1, 3)))
-    return estimated
+        rest = ([part.info for part in parts if part is not out] for out in parts)
+        systems = (PointsFirst(joined(some), prior) for some in rest)
+    else:
+        whole = np.asarray(sum(part.matrix for part in parts))
+        systems = (PosesFirst(out.info, prior, whole - out.matrix) for out in parts)
+    return [minimum_of(system, sizes, variance) for system in systems]

@@ -14,6 +14,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.board.posterior import minimum_of
 from neurocal_cli.adjustment.board.prior import nearest_to_given
+from neurocal_cli.adjustment.board.system import system_of
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.monotonic_fit import ROUNDS, TIE, next_penalty, told_of_fold
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, free_parameters, rig_problem
@@ -93,7 +94,7 @@ def _moved(target: Target, fit: RigFit) -> Target | None:
     """The most probable target, all other unknowns following it; None if it is not determined."""
     info, prior = information_of_rig(target, fit)
     try:
-        _, offsets = minimum_of(info, prior, target.sizes, fit.variance)
+        _, offsets = minimum_of(system_of(info, prior), target.sizes, fit.variance)
     except np.linalg.LinAlgError:
         return None
     world = target.given + prior.in_world(offsets)
