@@ -49,9 +49,8 @@ class End(Enum):
 
     BOARD = "the board ends there"
     STOPS = "the pattern stops there: the board ends, or something hides the rest of it"
-    DIM = "the same in the dark, where the board ends before light at other sides: it may be a shadow"
     PATTERN = "the pattern goes on"
-    OUTSIDE = "outside the image"
+    OUTSIDE = "outside the image, or behind something before the board"
     UNKNOWN = "hidden or blurred"
 
 
@@ -61,13 +60,23 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
         sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
         sides += _opposite(grey, grid.pixels, grid.dark)
         found = [_classify(*side) for side in sides]
-    # The margin of most sides; the light one if there are as many dark ones, which may be shadows.
-    margins = sorted(margin for end, margin in found if end is End.BOARD)
-    usual = margins[len(margins) // 2] if margins else 0.0
-    return {
-        direction: End.DIM if end is End.BOARD and abs(margin - usual) > _DIFFERENT else end
-        for direction, (end, margin) in zip(DIRECTIONS, found, strict=True)
-    }
+        # The margin of most sides; the light one if there are as many dark ones, which may be shadows.
+        margins = sorted(margin for end, margin in found if end is End.BOARD)
+        usual = margins[len(margins) // 2] if margins else np.nan
+        ends = dict(zip(DIRECTIONS, (end for end, _ in found), strict=True))
+        for direction, (light, profile, _), (end, margin) in zip(DIRECTIONS, sides, found, strict=True):
+            if end in (End.BOARD, End.STOPS) and _is_covered(light, profile, usual):
+                ends[direction] = End.OUTSIDE
+            elif end is End.BOARD and abs(margin - usual) > _DIFFERENT:
+                ends[direction] = End.STOPS  # before the dark: it may be a shadow
+    return ends
+
+
+def _is_covered(light: NDArray[np.bool_], profile: Array, margin: float) -> bool:
+    """Whether something cuts squares of the ring, and the board's margin, known from others, is not seen."""
+    beyond = profile[:, _BEYOND].mean(axis=1)
+    cut = (np.abs(beyond - light) > _SAME) & (_crossings(profile, light, beyond) < 1 - _AT_THE_LINE)
+    return bool((np.abs(beyond - margin) > _SAME).mean() >= _SHARE and cut.any())
 
 
 def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
