@@ -217,7 +217,7 @@ def in_shadow(light: float) -> tuple[np.ndarray, Grid]:
     )
 
 
-@pytest.mark.parametrize(("light", "end"), [(0.1, End.PATTERN), (0.0, End.DIM)])
+@pytest.mark.parametrize(("light", "end"), [(0.1, End.PATTERN), (0.0, End.STOPS)])
 def test_a_shadow_that_begins_at_a_line_is_no_end(light: float, end: End) -> None:
     image, lit = in_shadow(light)
     assert board_ends(image, lit)[1, 0] is end

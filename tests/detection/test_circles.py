@@ -153,10 +153,25 @@ def test_rings_are_round(radius: int, width: int) -> None:
 def test_another_number_of_circles_is_no_board() -> None:
     scene = marked_scene(plane_of(ASYMMETRIC), 2, square=22.0)
     image = taken(scene, 2).image
-    with pytest.raises(NoBoardError, match="no part of a board of 3 x 7 circles"):
-        detect_points(image, Board((plane_of("asymmetric_circles:3x7:20:16"),)))
-    with pytest.raises(NoBoardError, match="several parts of the board; show all of it"):
-        detect_points(image, Board((plane_of("asymmetric_circles:5x9:20:16"),)))
+    for size in ("3x7", "5x9", "4x8"):
+        with pytest.raises(NoBoardError, match=f"no part of a board of {size.replace('x', ' x ')} circles"):
+            detect_points(image, Board((plane_of(f"asymmetric_circles:{size}:20:16"),)))
+
+
+@pytest.mark.parametrize("form", [ASYMMETRIC, "circles:5x4:20:16"])
+def test_a_part_of_the_board_is_known_by_the_paper_around_it(form: str) -> None:
+    scene = marked_scene(plane_of(form), 3, square=22.0)
+    picture = taken(scene, 3)
+    middle = int(picture.truth.planes[0].vertices[..., 0].mean())
+    covered, pale = picture.image.copy(), picture.image.copy()
+    covered[:, middle:] = 128
+    found = detect_points(covered, scene.board)
+    error, _ = errors(found, Rendered(covered, picture.truth))
+    assert len(error) == len(found.ids) > 7
+    assert np.abs(error).max() < 0.03
+    pale[:, middle:] = np.quantile(pale, 0.99)  # a sheet that looks like the paper of the board
+    with pytest.raises(NoBoardError, match=r"several parts|no part"):
+        detect_points(pale, scene.board)
 
 
 def test_circles_of_a_board_have_a_file_of_their_own() -> None:

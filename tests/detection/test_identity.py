@@ -266,6 +266,22 @@ def test_the_ends_of_a_board_are_told_from_the_frame_and_from_something_before_i
     assert board_ends(left, shifted)[-1, 0] is not End.BOARD
 
 
+@pytest.mark.parametrize("level", [0.1, 0.5])
+def test_a_board_of_which_something_straight_hides_a_half_is_labelled(level: float) -> None:
+    """The other ends show the margin of the board, so this is none, though it cuts near a line."""
+    scene, seen = condition("tilt 0", 0), picture("tilt 0", 0)
+    (grid,) = seen_grids(scene, seen)
+    first, last = grid.pixels[0, 5], grid.pixels[-1, 5]
+    v, u = np.indices(seen.image.shape)
+    tilted = last - 0.3 * (grid.pixels[-1, 6] - last) - first
+    beyond = tilted[0] * (v - first[1]) - tilted[1] * (u - first[0])
+    image = np.where(beyond < 0, round(255 * level), seen.image).astype(np.uint8)
+    rest = Grid(grid.pixels[:, :5], grid.dark)
+    found = labelled_vertices(identify(scene.board, [rest], image))
+    assert same(found, {name: one for name, one in true_vertices(seen).items() if name in found})
+    assert len(found) == rest.seen.sum()
+
+
 def test_a_board_without_margin_before_a_dark_wall_ends_too() -> None:
     scene = single(Recipe(), np.random.default_rng(0))
     target = replace(scene.targets[0], margin=Sides.all(0.0))

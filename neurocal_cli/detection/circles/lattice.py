@@ -5,6 +5,8 @@ of an asymmetric one stand on their corners. From a start in the middle, neighbo
 around them predict them. The lattice then is compared with the board in all ways that keep its handedness.
 Perspective may make other vectors shorter than those of the rows, so the basis may be sheared.
 
+If only a part of the board is seen, paper beside its circles tells where the board ends.
+
 A round thing beside the board may look like one of its circles, and change which part of the board seems to
 be seen. So marks that are not where those around them predict them are left out, and one that is on no place
 of the board.
@@ -25,7 +27,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.appearance import are_circles
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import predict_vertices
-from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
+from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels, interpolate
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -187,6 +189,11 @@ _SLANT = 0.35  # least sine of the angle between the steps at the start
 _STARTS = 30  # blobs that are tried as a start
 _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
+_MOST_AROUND = 5  # circles around a place beside those that are seen; there are more around one between them
+_WITHIN = 0.6  # of the radius: from the middle of a place beside them, up to which paper has to go on ...
+_SAMPLES = 6  # ... in as many samples
+_BARE = 0.75  # of the light from ink to paper, above which there is paper
+_MOST_WRONG = 0.1  # of the places beside a part of the board
 _SYMMETRIC = (
     "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
@@ -228,7 +235,7 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     kept = np.isfinite(area)
     if kept.sum() < least:
         return None
-    placed = _placed(plane, blobs, index[kept], at[kept])
+    placed = _placed(plane, blobs, index[kept], at[kept], grey)
     places = plane.spread(placed.place.astype(float))
     if not are_circles(grey.astype(np.float32), places, placed.centre, placed.area, described=True):
         raise NoBoardError(
@@ -312,7 +319,11 @@ def _steps(blobs: Blobs, away: Array, start: int) -> Array | None:
 
 
 def _placed(
-    plane: CirclePlane, blobs: Blobs, index: NDArray[np.int64], at: NDArray[np.intp]
+    plane: CirclePlane,
+    blobs: Blobs,
+    index: NDArray[np.int64],
+    at: NDArray[np.intp],
+    grey: NDArray[np.uint8],
 ) -> PlacedCircles:
     """Compare a lattice with the board in all bases and places."""
     board = _lattice_of(plane)
@@ -326,26 +337,61 @@ def _placed(
                 found.append(places)
     if len(set(but_one)) == 1 and not found:
         kept = np.arange(len(index)) != but_one[0]
-        return _placed(plane, blobs, index[kept], at[kept])
-    if not found and not but_one:
-        size = index.max(axis=0) - index.min(axis=0) + 1
-        raise NoBoardError(
-            f"the image shows {len(index)} circles in {size[0]} x {size[1]} rows, no part of a board "
-            f"of {plane.cols} x {plane.rows} circles; correct its description"
-        )
+        return _placed(plane, blobs, index[kept], at[kept], grey)
     names = [np.array([board[tuple(one)] for one in places.tolist()]) for places in found]
-    if len(found) == 1:
-        return PlacedCircles(names[0], blobs.centre[at], blobs.area[at])
-    # Those of a board that looks the same after a turn contain the same places, turned about its middle.
-    whole = len(index) == plane.cols * plane.rows
-    turns = {tuple(map(tuple, np.unique(one, axis=0))) for one in names}
-    alike = len(turns) == 1 or (len(turns) > 1 and _are_turns(plane, names))
-    if not found or (not whole and not (alike and _is_symmetric(plane))):
+    several = bool(but_one) and not found
+    if len(index) < len(board) and len(names) > 1 and not _are_turns(plane, names):
+        beside = [_paper_beside(places, board, blobs, at, grey) for places in found]
+        kept = [k for k, (shown, _) in enumerate(beside) if shown <= _MOST_WRONG]
+        names = [names[k] for k in kept]
+        several = any(beside[k][1] > _MOST_WRONG for k in kept)
+        several |= len(names) > 1 and not _are_turns(plane, names)
+    if several:
         raise NoBoardError(
             f"the image shows {len(index)} circles, which may be several parts of the board; show all of it"
         )
-    chosen = max(range(len(found)), key=lambda k: _rightwards(names[k], blobs.centre[at]))
-    return PlacedCircles(names[chosen], blobs.centre[at], blobs.area[at], (_SYMMETRIC,))
+    if not names:
+        raise NoBoardError(
+            f"the image shows {len(index)} circles, no part of a board of {plane.cols} x {plane.rows} "
+            "circles; correct its description"
+        )
+    chosen = max(range(len(names)), key=lambda k: _rightwards(names[k], blobs.centre[at]))
+    return PlacedCircles(names[chosen], blobs.centre[at], blobs.area[at], (_SYMMETRIC,) * (len(names) > 1))
+
+
+def _paper_beside(
+    places: NDArray[np.int64],
+    board: dict[tuple[int, int], tuple[int, int]],
+    blobs: Blobs,
+    at: NDArray[np.intp],
+    grey: NDArray[np.uint8],
+) -> tuple[float, float]:
+    """Where there is paper beside a part of the board, at its places (N, 2), and where it should be.
+
+    Returns the share of the next places on the board that show paper, and of those beyond it that show none.
+    The paper has to go on from the circles beside a place to well within it.
+    """
+    low = places.min(axis=0) - 2
+    pixels = np.full((*(places.max(axis=0) - low + 3)[::-1], 2), np.nan)
+    x, y = (places - low).T
+    pixels[y, x] = blobs.centre[at]
+    row, col, around = frontier(np.isfinite(pixels[..., 0]), 1)
+    beside = np.asarray(around) <= _MOST_AROUND
+    row, col = row[beside], col[beside]
+    on_board = np.array([tuple(one) in board for one in (np.column_stack([col, row]) + low).tolist()])
+    next_to = predict_vertices(pixels, row, col)
+    radius = np.sqrt(np.median(blobs.area[at]) / (np.pi * np.median(np.abs(next_to.area))))
+    share = [-0.5, 0.0, 0.5 * radius, 0.9 * radius, *np.linspace(0.5, 1 - _WITHIN * radius, _SAMPLES)]
+    start = np.stack([pixels[row + r, col + c] for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))])
+    way = start[:, :, None] + np.array(share)[:, None] * (next_to.points - start)[:, :, None]
+    light = interpolate(grey.astype(np.float32), np.nan_to_num(way))
+    paper, ink = light[..., 0], light[..., 1:4].min(axis=-1)
+    bare = light[..., 4:].min(axis=-1) > ink + np.maximum(_BARE * (paper - ink), _STEPS[0])
+    inside = ((way >= 0) & (way <= np.array(grey.shape[::-1]) - 1)).all(axis=(2, 3))
+    known = np.isfinite(start[..., 0])
+    bare, inside = ((one | ~known).all(axis=0) for one in (bare, inside))
+    shown, missing = bare & inside & on_board, ~bare & inside & ~on_board
+    return shown.sum() / max(on_board.sum(), 1), missing.sum() / max((~on_board).sum(), 1)
 
 
 def _lattice_of(plane: CirclePlane) -> dict[tuple[int, int], tuple[int, int]]:
@@ -376,19 +422,19 @@ def _shifted(
 
 
 def _are_turns(plane: CirclePlane, names: list[NDArray[np.int64]]) -> bool:
-    """Whether placements differ by turns of the whole board about its middle only."""
-    places = [plane.spread(one.astype(float)) for one in names]
+    """Whether placements differ only by turns of a board that looks the same after half a turn.
+
+    They contain the same places, or those turned about the middle of the board.
+    """
     every = plane.spread(plane.midpoint_grid())
-    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
-    radius = np.hypot(*(places[0] - middle).T)
-    return all(np.allclose(np.hypot(*(one - middle).T), radius) for one in places[1:])
-
-
-def _is_symmetric(plane: CirclePlane) -> bool:
-    """Whether the whole board looks the same after half a turn; else only a part of it does."""
-    places = plane.spread(plane.midpoint_grid())
-    turned = places.min(axis=0) + places.max(axis=0) - places
-    return {tuple(one) for one in places.tolist()} == {tuple(one) for one in turned.tolist()}
+    turned = every.min(axis=0) + every.max(axis=0) - every
+    places = [plane.spread(one.astype(float)) for one in names]
+    if {tuple(one) for one in every.tolist()} != {tuple(one) for one in turned.tolist()}:
+        return False
+    if len({tuple(map(tuple, np.unique(one, axis=0))) for one in names}) == 1:
+        return True
+    radius = [np.hypot(*(one - 0.5 * (every.min(axis=0) + every.max(axis=0))).T) for one in places]
+    return all(np.allclose(one, radius[0]) for one in radius)
 
 
 def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
