@@ -2,9 +2,10 @@
 
 The board's ends exclude most of them. One more ring of squares surrounds the outer vertices. If the board
 ends, the brightness beyond the ring is the same next to dark and light squares, and the change is where the
-next vertices would be. An occluder, a shadow or the image border cuts the ring at another place. A shadow may
-begin just at a line of the board. The pattern may be seen in it faintly. If not, what lies beyond is dark at
-one side and light at the others, so that side is not taken for an end.
+next vertices would be. An occluder, a shadow or the image border cuts the ring at another place, and an
+occluder hides the margin that other sides show. A shadow may begin just at a line of the board. The pattern
+may be seen in it faintly. If not, what lies beyond is dark at one side and light at the others, so that side
+is not taken for an end.
 
 Before that, `trimmed` removes outer lines of a grid that are not lines of the board. False vertices occur
 where a corner of the paper lies near the outer squares, and at corners of squares on a fold.
@@ -33,6 +34,7 @@ DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _STEPS = np.arange(0.60, 1.71, 0.05)  # squares outwards from the outer vertices
 _RING, _BEYOND = _STEPS < 0.76, (_STEPS > 1.19) & (_STEPS < 1.41)
 _MARGIN = (_STEPS > 1.09) & (_STEPS < 1.16)  # of a board whose margin is narrow
+_PAST = (_STEPS > 1.01) & (_STEPS < 1.19)  # at the beginning of the next squares
 _NEXT = _STEPS > 1.29  # in the middle of the next squares
 _FAR = int(np.count_nonzero(_STEPS < 1.41)) - 1
 _ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a square
@@ -73,10 +75,16 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
 
 
 def _is_covered(light: NDArray[np.bool_], profile: Array, margin: float) -> bool:
-    """Whether something cuts squares of the ring, and the board's margin, known from others, is not seen."""
-    beyond = profile[:, _BEYOND].mean(axis=1)
-    cut = (np.abs(beyond - light) > _SAME) & (_crossings(profile, light, beyond) < 1 - _AT_THE_LINE)
-    return bool((np.abs(beyond - margin) > _SAME).mean() >= _SHARE and cut.any())
+    """Whether something hides the rest: it cuts squares of the ring, or some of the next ones are seen.
+
+    The margin, which is known from other sides, is not seen.
+    """
+    beyond, past = profile[:, _BEYOND].mean(axis=1), profile[:, _PAST]
+    before = _crossings(profile, light.astype(float), beyond) < 1 - _AT_THE_LINE
+    cut = before & (np.abs(beyond - light) > _SAME)
+    turned = past[~light].max(axis=0, initial=0) - past[light].min(axis=0, initial=1)
+    away = np.abs(beyond - margin) > _SAME
+    return bool(away.mean() >= _SHARE and (cut.any() or turned.max() > _DIFFERENT))
 
 
 def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
@@ -94,7 +102,7 @@ def _classify(light: NDArray[np.bool_], profile: Array, outside: NDArray[np.bool
     ring = profile[:, _RING].mean(axis=1)
     valid = np.abs(ring - light) < _SAME
     count = np.count_nonzero(valid)
-    if count < max(_FEWEST, 0.6 * len(valid)):
+    if count < max(_FEWEST, min(0.6 * len(valid), int(np.isfinite(ring).sum()))):
         return End.UNKNOWN, np.nan
     profile, ring, light = profile[valid], ring[valid], light[valid]
     if light.all() or not light.any():
