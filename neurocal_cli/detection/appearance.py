@@ -252,6 +252,8 @@ def _meet(quads: Array, own: Array) -> bool:
     beyond[: _BEYOND + 1] = side[_BEYOND::-1]
     expected = within**2 + beyond**2 - np.maximum(within + beyond - 1, 0) ** 2
     lost = float((expected - corner).sum() * (_DEPTH[1] - _DEPTH[0]))
-    along, down = (quads[:, 3] - quads[:, 0]).T, (quads[:, 2] - quads[:, 1]).T
-    width = np.sqrt(0.5 * float(np.median(np.abs(along[0] * down[1] - along[1] * down[0]))))
+    along, down = quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0]
+    area = np.abs(np.linalg.det(np.stack([along, down], axis=1)))
+    longest = np.maximum(np.hypot(*along.T), np.hypot(*down.T))
+    width = float(np.median(area / longest))  # of squares that are seen from the side, the height
     return lost < max(_ROUNDED, _ROUNDED_PX / max(width, 1.0))
