@@ -53,7 +53,7 @@ def has_other_cause(
     if named_lens and n_views < _TELL_BENDS and richer_lens_is_better(found):
         return True
     fits = views_for_target(fits)
-    held = [_contest_at(fit, named_lens, worth) for fit in fits]
+    held = [_contest_at(fit, worth) for fit in fits]
     # An equation of the contest, which is on the given target, may count less on the found one.
     counted = min(counted_again(found, fits), 1.0)
     others = sum(one.instead_of_target(counted) for one in held if one is not None)
@@ -75,16 +75,14 @@ def contest_of(
 ) -> Contest | None:
     """The contest at a fit, by default that of the solution, whose target's shape was estimated or not."""
     fit = fit or (solution.problem, solution.adjusted)
-    return _contest_at(fit, solution.has_named_lens, solution.repeated.worth, shaped)
+    return _contest_at(fit, solution.repeated.worth, shaped)
 
 
-def _contest_at(
-    fit: tuple[Problem, Adjusted], named_lens: bool, worth: float, shaped: bool = False
-) -> Contest | None:
+def _contest_at(fit: tuple[Problem, Adjusted], worth: float, shaped: bool = False) -> Contest | None:
     problem, adjusted = fit
     return contest(
         problem.views, adjusted.state, problem.free_camera, problem.free_poses, problem.points.image_size,
-        named_lens=named_lens, worth=worth, shaped=shaped,
+        worth=worth, shaped=shaped,
     )  # fmt: skip
 
 

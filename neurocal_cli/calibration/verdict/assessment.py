@@ -63,6 +63,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, cross_matrix, median
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import std_of_scale
@@ -335,9 +336,8 @@ class _AtMinimum:
 
     def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
         target = self.calibration.target
-        selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
         held = contest(
-            views, state, self.free, self.free_poses, self.points.image_size, named_lens=not selected,
+            views, state, free_entries(self.calibration, NODES), self.free_poses, self.points.image_size,
             worth=self.repeated.worth, shaped=target is not None and target.bends is None,
         )  # fmt: skip
         if held is None or not self.free_poses:

@@ -89,21 +89,20 @@ def contest(
     free_poses: bool,
     image_size: tuple[int, int] | None,
     *,
-    named_lens: bool = True,
     worth: float = 1.0,
     shaped: bool = False,
 ) -> Contest | None:
     """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
 
     The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
-    estimated. A lens that was selected is not too simple. `worth` is the effective share of the views if they
-    repeat poses. `shaped` tells whether the target's common shape was estimated with the camera.
+    estimated. `worth` is the effective share of the views if they repeat poses. `shaped` tells whether the
+    target's common shape was estimated with the camera.
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
 
     def at_minimum(*more: Effect) -> Linearised:
-        lin = linearised(views, state, free, free_poses, (*EFFECTS, *more), image_size, named_lens)
+        lin = linearised(views, state, free, free_poses, (*EFFECTS, *more), image_size)
         return _with_shape(lin) if shaped else lin
 
     try:
@@ -312,8 +311,9 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
             found = _likelier_than_not(contest, told, calibration)
             names = dict.fromkeys(x.rival.cause for x in told if x.rival.cause != found.rival.cause)
         grade, reason = _graded(contest, found, calibration)
-        if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
-            # The standard deviations do not include the board and the lens.
+        named = found.rival.steps is not None and not calibration.lens_choice
+        if found.pattern == "all" and (found.rival.of_board or named):
+            # The standard deviations do not include the board, nor a lens that was not selected.
             grade = max(grade, int(not found.rival.of_given))
         if contest.of_outliers and not place:
             grade = max(grade, 1)  # points are left out because of it

@@ -23,7 +23,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-_RICHER = {**dict.fromkeys(POLYNOMIAL_MODELS, POLYNOMIAL_MODELS[-1]), **DECENTRED}
+_RICHER = {**dict.fromkeys(POLYNOMIAL_MODELS, "plumb_bob"), "plumb_bob": "rational", **DECENTRED}
 _FLAT = 0.02  # largest thickness over size of a board that counts as flat
 _ACROSS = 11  # points of a grid on the board
 _ALONG = 1e-6  # by which a normal that is an axis of the world may differ from it
@@ -136,15 +136,13 @@ def linearised(
     free_poses: bool,
     effects: tuple[Effect, ...],
     image_size: tuple[int, int] | None,
-    richer: bool = True,
 ) -> Linearised:
     """Linearise a camera at its minimum.
 
     The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
-    estimated. `richer` asks for the coefficients that the distortion model lacks.
+    estimated.
     """
-    if richer:
-        state = state.with_model(_RICHER.get(state.model, state.model))
+    state = state.with_model(_RICHER.get(state.model, state.model))
     K, board = len(state.k), Board.of(views)
     middle = np.zeros(2)
     if image_size is not None:

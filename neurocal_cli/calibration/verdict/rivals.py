@@ -34,7 +34,7 @@ RICHER_LENSES = tuple(
         effects.common,
         steps=effects.lens(model),
     )
-    for model in (*POLYNOMIAL_MODELS[1:], "omnidir")
+    for model in (*POLYNOMIAL_MODELS[1:], "rational", "omnidir")
 )
 """A lens that lacks coefficients."""
 

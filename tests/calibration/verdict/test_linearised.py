@@ -39,7 +39,7 @@ def at(points: Correspondences, state: CameraState, free: int = 0) -> tuple[Line
     views = arrange(points)
     some = np.arange(5) < free
     there = adjust(views.batches, normalised(state, views), some, True, 20).state
-    return linearised(views, there, some, True, EFFECTS, SIZE, False), views, there
+    return linearised(views, there, some, True, EFFECTS, SIZE), views, there
 
 
 def left(lin: Linearised, effect: Effect, amounts: Array) -> float:
@@ -173,7 +173,7 @@ def test_a_new_cause_is_a_rival_and_wins_where_it_is_the_cause() -> None:
     views = arrange(with_pixels(points, np.column_stack([3.0 * u * v, 0 * u]) + noise))
     free = np.ones(5, dtype=bool)
     there = adjust(views.batches, normalised(state, views), free, True, 20).state
-    lin = linearised(views, there, free, True, (*EFFECTS, keystone), SIZE, False)
+    lin = linearised(views, there, free, True, (*EFFECTS, keystone), SIZE)
     first, second = estimates(lin, lin.spare, (*RIVALS, new))[:2]
     assert first.rival is new
     assert first.evidence > second.evidence + LEVEL
@@ -199,7 +199,7 @@ def test_the_derivatives_of_many_points_are_never_held_all_at_once() -> None:
     there, free = normalised(state, views), np.ones(5, dtype=bool)
     tracemalloc.start()
     try:
-        lin = linearised(views, there, free, True, EFFECTS, SIZE, False)
+        lin = linearised(views, there, free, True, EFFECTS, SIZE)
         most = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

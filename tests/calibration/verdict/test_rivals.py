@@ -368,6 +368,20 @@ def test_a_lens_that_is_too_simple_is_told() -> None:
     assert "the distortion model is too simple: k1k2" in reasons(calibrate(points, distortion="k1"))
 
 
+def test_a_selected_lens_that_is_too_simple_is_not_taken_for_two_cameras() -> None:
+    found = calibrate(scene(12082)[0])
+    assert found.distortion_model == "plumb_bob"
+    assert winner(found).rival.cause == "a lens that is too simple"
+    assert "two cameras" not in reasons(found)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_bent_board_is_the_only_cause_through_a_lens_from_straight_lines(seed: int) -> None:
+    points, _ = target_photographed("parabola", seed, 8, 0.5)
+    causes = held(calibrate(points, distortion="plumb-line", skew=False)).causes
+    assert [one.rival.cause for one in causes] == ["a bent target"]
+
+
 # Two at once.
 
 
