@@ -25,6 +25,7 @@ from neurocal_cli.calibration.lens_choice.monotonic_fit import normal_part
 from neurocal_cli.calibration.lens_choice.rich_fit import promised, with_displacement
 from neurocal_cli.calibration.other_causes import contest_of
 from neurocal_cli.calibration.outlier_rejection import fit_robustly
+from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.options import Options
@@ -74,7 +75,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     repeated = solution.repeated
     held = contest_of(solution) if repeated.n_poses >= _FEWEST else None
     # What differs from view to view may be the lens: other parts of it are seen.
-    if held is None or held.of_all_views:
+    if held is None or (held.of_all_views and held.causes[0].rival not in RICHER_LENSES):
         return None
     problem = problem.with_points(problem.points if target is None else target.as_given(problem.points))
     fisheye, adjusted = as_fisheye(problem, normalised(solution.in_pixels, problem.views))
