@@ -28,6 +28,8 @@ from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.noise import stated_noise
+from neurocal_cli.calibration.verdict.rival import causes_among
+from neurocal_cli.calibration.verdict.rivals import NEIGHBOURS
 from neurocal_cli.camera.geometry import Array, median
 
 _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
@@ -45,19 +47,24 @@ def has_other_cause(
 ) -> bool:
     """Whether the errors on the given target have another cause than the shape that was found.
 
-    Each camera is at its minimum for the given target. `worth` is the effective share of the views if they
-    repeat poses.
+    It may be noise that neighbours share. Each camera is at its minimum for the given target. `worth` is the
+    effective share of the views if they repeat poses.
     """
     # One or two views of planes that bend and were set up by hand show distortion as another target.
     n_views = sum(problem.views.n_views for problem, _ in fits)
     if named_lens and n_views < _TELL_BENDS and richer_lens_is_better(found):
         return True
     fits = views_for_target(fits)
-    held = [_contest_at(fit, worth) for fit in fits]
     # An equation of the contest, which is on the given target, may count less on the found one.
     counted = min(counted_again(found, fits), 1.0)
-    others = sum(one.instead_of_target(counted) for one in held if one is not None)
-    return others > gain_over_given(found, fits)
+    others = shared = 0.0
+    for problem, adjusted in fits:
+        held = contest_of(problem, adjusted, worth)
+        if held is not None:
+            others += held.instead_of_target(counted)
+            noise = causes_among((NEIGHBOURS,), problem, adjusted.state, held.n)
+            shared += max((one.evidence for one in noise), default=0.0)
+    return max(others, shared) > gain_over_given(found, fits)
 
 
 def contradicts_sigma(solution: Solution) -> bool:
@@ -70,16 +77,8 @@ def contradicts_sigma(solution: Solution) -> bool:
     return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
 
 
-def contest_of(
-    solution: Solution, fit: tuple[Problem, Adjusted] | None = None, shaped: bool = False
-) -> Contest | None:
-    """The contest at a fit, by default that of the solution, whose target's shape was estimated or not."""
-    fit = fit or (solution.problem, solution.adjusted)
-    return _contest_at(fit, solution.repeated.worth, shaped)
-
-
-def _contest_at(fit: tuple[Problem, Adjusted], worth: float, shaped: bool = False) -> Contest | None:
-    problem, adjusted = fit
+def contest_of(problem: Problem, adjusted: Adjusted, worth: float, shaped: bool = False) -> Contest | None:
+    """The contest at a fit, whose target's shape was estimated or not; `worth` is that of repeated poses."""
     return contest(
         problem.views, adjusted.state, problem.free_camera, problem.free_poses, problem.points.image_size,
         worth=worth, shaped=shaped,
@@ -119,7 +118,7 @@ def odd_view(solution: Solution) -> str | None:
     left = _contradictions(others.normal, free, own[rest]) / conditions[rest] / variance
     if not contradiction[view] > OUTLIER * max(float(median(left)), 1.0):
         return None
-    held = contest_of(solution)
+    held = contest_of(problem, adjusted, solution.repeated.worth)
     differs = held is not None and any(one.pattern != "all" for one in held.causes)
     return views.names[view] if differs else None
 

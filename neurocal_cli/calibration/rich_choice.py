@@ -73,7 +73,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
         return None
     repeated = solution.repeated
-    held = contest_of(solution) if repeated.n_poses >= _FEWEST else None
+    held = contest_of(problem, solution.adjusted, repeated.worth) if repeated.n_poses >= _FEWEST else None
     # What differs from view to view may be the lens: other parts of it are seen.
     if held is None or (held.of_all_views and held.causes[0].rival not in RICHER_LENSES):
         return None
@@ -93,7 +93,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     views, state = rich.problem.views, rich.state
     if correlation(views, point_residuals(views, state)) > _NOISE:
         return None
-    odd = contest_of(rich)
+    odd = contest_of(rich.problem, rich.adjusted, rich.repeated.worth)
     if odd is not None and any(one.rival.cause in _BETWEEN for one in odd.causes):
         return None
     rms = float(np.sqrt(lost.sum() / len(views.index))) * views.pixel_scale

@@ -210,13 +210,13 @@ def _searched(
     """Alternate between target and camera as `with_target` does, from the views of one solution."""
     if not _can_tell(solution, choice, None):
         return solution, rejected
+    kept = solution.noted(target_kept=choice == "auto")
     common = _found(solution, choice, None)
     found = common if choice == "flat" else _with_bends(solution, common)
     if found is not None and choice == "auto":
         fit, named = (solution.problem, solution.adjusted), solution.has_named_lens
         if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated.worth):
-            return solution, rejected
-    kept = solution.noted(target_kept=choice == "auto")
+            return kept, rejected
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):
         settled = None if start is None else _settled(problem, kept, rejected, options, choice, start)
@@ -313,7 +313,7 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
     gain = gain_over_given(found, [given]) if common is None else found.evidence - common.evidence
-    held = contest_of(solution, before, common is not None)
+    held = contest_of(*before, solution.repeated.worth, common is not None)
     return common if held is not None and held.instead_of_target() > gain else found
 
 

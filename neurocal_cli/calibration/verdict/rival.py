@@ -175,12 +175,14 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
     return sorted(best.values(), key=lambda one: -one.evidence)
 
 
-def causes_among(rivals: tuple[Rival, ...], problem: Problem, state: CameraState) -> list[Estimate]:
+def causes_among(
+    rivals: tuple[Rival, ...], problem: Problem, state: CameraState, n: float | None = None
+) -> list[Estimate]:
     """Those among some rivals at the minimum of a problem, as `estimates` has them; none if that fails."""
     effects = tuple(one.effect for one in rivals if one.effect is not None)
     lin = linearised(problem.views, state, problem.free_camera, problem.free_poses, effects, None)
     try:
-        return estimates(lin, lin.spare, rivals)
+        return estimates(lin, lin.spare if n is None else n, rivals)
     except np.linalg.LinAlgError:
         return []
 

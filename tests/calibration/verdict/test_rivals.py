@@ -460,6 +460,14 @@ def test_noise_that_neighbours_share_in_part_is_no_cause_that_differs_between_vi
     assert not any(some in said for some in ("moves", "moved", "two cameras", "bent", "bends")), said
 
 
+def test_noise_that_neighbours_share_in_part_is_no_other_target() -> None:
+    points, truth = scene(3125)
+    found = calibrate(
+        with_noise_that_neighbours_share(points, 1.2 * truth.sigma, np.random.default_rng(3125))
+    )
+    assert found.target is None
+
+
 def test_solid_targets_and_single_views_have_no_shape_of_a_board() -> None:
     found = held(calibrate(table_1().points(0.2, np.random.default_rng(1))))
     assert found.lin.board is None
