@@ -299,7 +299,9 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if calibration.type == 3:
         return
     ratio = A.alpha_u / A.alpha_v
-    if _oblong(calibration):
+    of_ratio = {"alpha_u": 1 / A.alpha_v, "alpha_v": -ratio / A.alpha_v}
+    by = np.array([of_ratio.get(name, 0.0) for name in calibration.covariance_names])
+    if abs(ratio - 1) > _OBLONG + TOLD * np.sqrt(by @ calibration.covariance @ by):
         yield (
             1,
             f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
@@ -350,14 +352,6 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
             f"within its plane: {WRONG_PRINT}",
             measure,
         )
-
-
-def _oblong(calibration: Calibration) -> bool:
-    """Whether the pixels are significantly not square."""
-    A, std = calibration.intrinsics, calibration.std
-    ratio = A.alpha_u / A.alpha_v
-    told = TOLD * np.hypot(std["alpha_u"], std["alpha_v"]) / A.alpha_v
-    return bool(abs(ratio - 1) > _OBLONG + told)
 
 
 def _off_centre(calibration: Calibration) -> Iterator[Finding]:

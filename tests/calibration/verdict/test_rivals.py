@@ -382,6 +382,13 @@ def test_a_bent_board_is_the_only_cause_through_a_lens_from_straight_lines(seed:
     assert [one.rival.cause for one in causes] == ["a bent target"]
 
 
+def test_pixels_that_are_not_square_are_told_where_both_focal_lengths_are_uncertain() -> None:
+    points, _ = target_photographed("flat", 700, 6, 0.0, sigma=1.2)
+    found = calibrate(replace(points, pixels=points.pixels * [1.06, 1.0]), target="given", distortion="k1k2")
+    assert found.std["alpha_u"] > 0.008 * found.intrinsics.alpha_u
+    assert "the pixels are not square: alpha_u / alpha_v = 1.0" in reasons(found)
+
+
 # Two at once.
 
 
