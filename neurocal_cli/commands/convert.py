@@ -16,7 +16,7 @@ from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.files.exchange.camera_set import CameraSet
+    from neurocal_cli.files.exchange.format_table import CameraSet
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.points import Correspondences
 
@@ -176,7 +176,7 @@ def convert(
     preparation.check_outputs(() if folder else (output,), (*files, board.file))
     described = board.file is not None or board.square is not None
     target_board = (board if described else replace(board, unit=None)).read()
-    from neurocal_cli.files.exchange.camera_set import CameraSet
+    from neurocal_cli.files.exchange.format_table import CameraSet
 
     with repeatable_stdin() if "-" in files else nullcontext():
         found = _read(files, target_board, board.unit, image_size, distortion, what)
@@ -207,7 +207,7 @@ def _read(
     what: str | None,
 ) -> Correspondences | CameraSet:
     """The points of the files or, if they hold none, the cameras; with values that the files lack."""
-    from neurocal_cli.files.exchange.camera_set import CameraSet
+    from neurocal_cli.files.exchange.format_table import CameraSet
     from neurocal_cli.files.exchange.reading import read_points_or_cameras
 
     read = warned if size is None else noted  # warnings are about the size

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rectification import RectifiedPair, RowError
     from neurocal_cli.calibration.rig.rig import StereoRig
     from neurocal_cli.camera.remapping import Remapping
-    from neurocal_cli.files.exchange.camera_set import CameraSet
+    from neurocal_cli.files.exchange.format_table import CameraSet
     from neurocal_cli.observations.points import Correspondences
 
 _Paths = tuple[tuple[str, ...], tuple[str, ...]]  # of the left and of the right camera

@@ -26,7 +26,6 @@ from neurocal_cli.errors import InputError, value_failures
 from neurocal_cli.files.calibration_blocks import POSE_GROUPS, VERDICT
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_from_field, calibration_lines
 from neurocal_cli.files.camera_tree import read_tree
-from neurocal_cli.files.exchange.camera_set import METRES
 from neurocal_cli.files.key_tables import Keys, check_format, inline, named, record
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import block, boolean, list_lines, text
@@ -77,6 +76,8 @@ def stereo_lines(rig: StereoRig, alpha: float | None, by_rows: bool) -> Iterator
 
 def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, str]:
     """Texts of two calibration files for ROS's stereo nodes, with lengths in metres."""
+    from neurocal_cli.files.exchange.format_table import METRES  # loads what reading a rig does not need
+
     if rig.unit not in METRES:
         raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
     rectified = rectify(rig, alpha)

@@ -32,7 +32,7 @@ from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify_p
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.rig_report import stereo_report
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.exchange.reading import FORMATS
 

@@ -13,7 +13,7 @@ from support.places import SAMPLES
 from support.rigs import random_rig
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points, write_rig
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.rig_yaml import read_stereo_rig
 

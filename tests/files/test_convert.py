@@ -30,7 +30,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 SIZE = (640, 480)

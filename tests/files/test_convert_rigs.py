@@ -11,8 +11,8 @@ from neurocal_cli import Camera, Intrinsics, Pose
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import euler_to_rotation
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.dictionary import entries
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
 
 LENSES = {

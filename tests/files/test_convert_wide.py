@@ -23,7 +23,7 @@ from neurocal_cli.camera.nearest_camera import nearest_camera, with_model
 from neurocal_cli.commands.convert import convert
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 KEPT = [(name, model) for name, target in FORMATS.items() for model in WIDE if model in target.models]

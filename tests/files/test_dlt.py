@@ -12,8 +12,8 @@ from neurocal_cli import Intrinsics, Pose, calibrate, calibrate_rig, read_points
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.capture import dlt_coefficients
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.result_files import write_result
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"

@@ -16,7 +16,7 @@ from test_other_programs import POINT, check, rotated
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, NeurocalError
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.reading import read_cameras, read_points_or_cameras
 
 K = [[800.5, 0.0, 321.3], [0.0, 801.25, 238.7], [0.0, 0.0, 1.0]]

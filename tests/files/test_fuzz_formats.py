@@ -21,8 +21,8 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.corners import read_corners
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
 
 COUNT = int(os.environ.get("NEUROCAL_FUZZ", "10000"))

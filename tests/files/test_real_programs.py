@@ -17,7 +17,7 @@ from test_convert import POSES, RIGHT, lens, same, same_pose, some_points, writt
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
 
 EXACT = 1e-9

@@ -15,7 +15,7 @@ from support.places import SAMPLES
 from support.rigs import random_rig
 
 from neurocal_cli import write_calibration, write_rig
-from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.neurocal import as_stereo
 
 POINTS = SAMPLES / "points.csv"

@@ -14,8 +14,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, plural
-from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.format_table import Format
+from neurocal_cli.files.exchange.format_table import CameraSet, Format
 
 _NO_SKEW = 1e-3  # px; a smaller loss is not reported
 _NO_LOSS = 5e-3  # share of the image; a smaller lost part is not reported

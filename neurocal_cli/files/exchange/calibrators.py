@@ -20,9 +20,8 @@ from typing import Any
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.camera_set import STILL, CameraSet, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import STILL, CameraSet, Format, PoseKeys, Tree, after, inverse
 from neurocal_cli.files.exchange.tree_paths import python_text, yaml_text
 from neurocal_cli.files.tree_fields import Field
 

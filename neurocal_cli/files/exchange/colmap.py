@@ -18,9 +18,8 @@ from typing import Any
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.camera_set import CameraSet, after, to_quaternion
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after, to_quaternion
 from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.tree_fields import Field, is_number
 from neurocal_cli.files.yaml_text import number

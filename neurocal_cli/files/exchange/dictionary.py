@@ -27,9 +27,8 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data, storage_text
 from neurocal_cli.files.exchange.camera_names import NAMES, PARAMETERS, is_matrix, plain_lists
-from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector, to_vector
 from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document, NoCameraError
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, from_vector, to_vector
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.exchange.tree_paths import arrays

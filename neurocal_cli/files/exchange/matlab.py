@@ -15,9 +15,8 @@ import numpy as np
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_names import matrix_of
-from neurocal_cli.files.exchange.camera_set import CameraSet, from_vector
 from neurocal_cli.files.exchange.document import Document, stated
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, from_vector
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.mat_file import MARK, lists, saved
 from neurocal_cli.files.exchange.tree_paths import arrays, numbers_at

@@ -25,9 +25,8 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.camera_names import matrix_of
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format, Parts, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, Parts, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import in_order, in_rows
 from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field

@@ -19,9 +19,8 @@ from neurocal_cli.files.calibration_yaml import (
     neurocal_block,
 )
 from neurocal_cli.files.camera_tree import own_kind
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format
+from neurocal_cli.files.exchange.format_table import CameraSet, Format
 from neurocal_cli.files.rig_yaml import format_rig, rig_from_field, stereo_from_field
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences

@@ -10,9 +10,8 @@ import re
 from dataclasses import replace
 from typing import Any
 
-from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.nearest_lenses import with_fov
 from neurocal_cli.files.exchange.tree_paths import find, in_order, json_text, yaml_text
 from neurocal_cli.files.tree_fields import Field

@@ -9,9 +9,8 @@ import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_set import CameraSet, after
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after
 from neurocal_cli.files.exchange.tree_paths import json_text
 from neurocal_cli.files.tree_fields import Field
 

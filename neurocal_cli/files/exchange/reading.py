@@ -37,10 +37,9 @@ from neurocal_cli.files.exchange import (
     sensors,
 )
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
-from neurocal_cli.files.exchange.camera_set import CameraSet, after, inverse
 from neurocal_cli.files.exchange.corners import read_corners
 from neurocal_cli.files.exchange.document import KALIBR_REPORT, UNKNOWN, Document, NoCameraError
-from neurocal_cli.files.exchange.format_table import Format
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, after, inverse
 from neurocal_cli.files.exchange.neurocal import camera_set
 from neurocal_cli.files.exchange.tree_paths import in_rows
 from neurocal_cli.observations.board import Board

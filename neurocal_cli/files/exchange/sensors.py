@@ -7,9 +7,8 @@ from collections.abc import Mapping
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_set import STILL, after, inverse
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import Format, PoseKeys, Tree
+from neurocal_cli.files.exchange.format_table import STILL, Format, PoseKeys, Tree, after, inverse
 from neurocal_cli.files.exchange.tree_paths import in_order
 from neurocal_cli.files.image_files import read_header
 from neurocal_cli.files.tree_fields import Field
