@@ -171,11 +171,9 @@ def _lens(block: Field) -> ZoomLens:
         block["settings"]["rows"].fail("several rows of finite settings")
     settings = table.pop("settings").reshape(-1, len(controls))
     L, S = len(names), len(settings)
-    if head["scatter"].shape != (L,):
-        block["scatter"].fail(f"{L} finite numbers")
-    for bad, field in zip(head["rejected"], block["rejected"].items(), strict=True):
-        if len(bad.setting) != len(controls):
-            field["setting"].fail(f"{len(controls)} finite numbers")
+    block["scatter"].array(L)
+    for field in block["rejected"].items():
+        field["setting"].array(len(controls))
     members = tuple(_member(field, names, len(controls)) for field in block["members"].items())
     if not members:
         block["members"].fail("a list of at least one lens")
@@ -229,9 +227,8 @@ def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
         topology = Topology(D, int(hidden[0]), int(hidden[1]))
         if len(net["weights"]) == (older := replace(topology, rich=False)).n_weights:
             topology = older
-        for key, count in (("weights", topology.n_weights), ("precision", topology.n_groups)):
-            if len(net[key]) != count:
-                field_of_net[key].fail(f"{count} finite numbers")
+        field_of_net["weights"].array(topology.n_weights)
+        field_of_net["precision"].array(topology.n_groups)
         nets.append(ParameterNet(topology, **net))
     return Member(LensNets(scale, tuple(nets)), _CONSTANTS.read(field["constants"]))
 
@@ -241,8 +238,7 @@ def _table(field: Field, S: int, L: int, Q: int) -> Tables:
     upper = np.triu_indices(size)
     found = _TABLE.read(field)
     for key, shape in {"H": (S, len(upper[0])), "g": (S, size), "cost": (S,), "local": (S, L)}.items():
-        if found[key].shape != shape:
-            field[key].fail(f"{' x '.join(map(str, shape))} finite numbers")
+        field[key].array(*shape)
     H = np.zeros((S, size, size))
     H[:, upper[0], upper[1]] = found["H"]
     H[:, upper[1], upper[0]] = found["H"]
@@ -321,9 +317,8 @@ def _images(table: Table, controls: tuple[str, ...], setting: Array, several: bo
     own = table.labels.get("view")
     if own is None:
         return np.char.add(f"{Path(table.source).stem} ", texts) if several else texts
-    _, view = np.unique(own, return_inverse=True)
-    pairs = np.unique(np.column_stack([view.ravel(), index]), axis=0)
-    if len(pairs) == len(np.unique(view)):
+    views = own.tolist()
+    if len(set(zip(views, index.tolist(), strict=True))) == len(set(views)):
         return own
     return np.char.add(np.char.add(own, " "), texts)
 

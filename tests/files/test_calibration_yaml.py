@@ -307,7 +307,7 @@ def test_brackets_that_do_not_pair_up_in_a_row_are_a_syntax_error(row):
         parse_yaml(f"observations:\n  columns: [a]\n  rows:\n  - [{row}]\n  - [3]\n", "f")
 
 
-def test_line_numbers_survive_the_short_cut_for_rows(path, good):
+def test_the_line_of_a_syntax_error_below_the_rows_is_named(path, good):
     with pytest.raises(FormatError, match=rf"cal.yaml:{good.count(chr(10)) + 1}: is not valid YAML"):
         read(path, good + "]\n")
 

@@ -12,7 +12,7 @@ import numpy as np
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, value_failures
-from neurocal_cli.files.points_csv import PIXEL, PLACE, POINTS, correspondences, read_points
+from neurocal_cli.files.points_csv import PIXEL, PLACE, POINTS, correspondences
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.table import Table, read_table
 from neurocal_cli.files.table_header import column_names
@@ -49,13 +49,13 @@ class Given:
 
 def table_of(names: list[str], given: Given) -> Correspondences:
     """Read tables of points with their places."""
-    points = read_points(names, notes=given.notes)
-    stated = all(read_table(name, POINTS).metadata.unit for name in names)
+    tables = [read_table(name, POINTS) for name in names]
+    points = correspondences(tables, given.notes)
     if given.board is not None:
         given.notes.append(f"{points.source}: has the places of its points, so the board is not used")
     if given.unit in (None, points.unit):
         return points
-    if stated:
+    if all(table.metadata.unit for table in tables):
         raise FormatError(f"is in {points.unit}, not {given.unit}; leave out --unit", points.source)
     return replace(points, unit=str(given.unit))
 
