@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import zipfile
 from dataclasses import replace
@@ -92,6 +93,14 @@ def test_opencv_opens_the_matrices(tmp_path: Path) -> None:
         assert np.abs(storage.getNode("image_points").mat() - pixels()).max() == 0
         assert np.abs(storage.getNode("object_points").mat().reshape(-1, 3) - WORLD).max() == 0
         assert storage.getNode("view_names").at(1).string() == "im1"
+
+
+def test_opencv_s_packed_corners_are_read(tmp_path: Path) -> None:
+    place = tmp_path / "corners.yml.gz"
+    place.write_bytes(gzip.compress(str(corner_text(points(pixels()), "opencv", ".yml")).encode()))
+    found = read_corners([place], None, [])
+    assert found is not None
+    assert rows(found) == rows(points(pixels()))
 
 
 def test_corners_as_opencv_s_calibration_sample_writes_them_are_read(tmp_path: Path) -> None:
