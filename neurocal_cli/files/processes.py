@@ -9,10 +9,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import chain, repeat
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, TypeVar
@@ -91,16 +91,8 @@ def work_off(
     """
     # Started afresh: a fork of a process whose libraries have threads may hang.
     context = multiprocessing.get_context("spawn")
-    waiting: deque[tuple[Task, int]] = deque()
-    rest = iter(tasks)
+    rest: Iterator[tuple[Task, int]] = zip(tasks, repeat(1), strict=False)
     workers: dict[Connection, _Worker[Task]] = {}
-
-    def next_task() -> tuple[Task, int] | None:
-        if waiting:
-            return waiting.popleft()
-        for task in rest:
-            return task, 1
-        return None
 
     def start(task: Task, tries: int) -> None:
         ours, theirs = context.Pipe()
@@ -113,7 +105,7 @@ def work_off(
             ours.send(task)
 
     try:
-        while len(workers) < jobs and (first := next_task()):
+        while len(workers) < jobs and (first := next(rest, None)):
             start(*first)
         while workers:
             for connection in wait(list(workers)):
@@ -125,13 +117,13 @@ def work_off(
                     connection.close()
                     worker.process.join()
                     if worker.tries < _TRIES:
-                        waiting.append((worker.task, worker.tries + 1))
+                        rest = chain([(worker.task, worker.tries + 1)], rest)
                     else:
                         yield worker.task, None
-                    if following := next_task():
+                    if following := next(rest, None):
                         start(*following)
                     continue
-                if following := next_task():
+                if following := next(rest, None):
                     workers[connection] = _Worker(worker.process, connection, *following)
                     with suppress(OSError):
                         connection.send(following[0])
