@@ -320,12 +320,8 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
 
 def _check_one_camera(tables: list[Table]) -> None:
     """Refuse the points of several cameras, which one camera cannot fit."""
-    columns = [
-        (table, dict.fromkeys(table.labels["camera"].tolist()))
-        for table in tables
-        if "camera" in table.labels
-    ]
-    named = {name: table for table, names in columns for name in names}
+    columns = [(table, table.labels["camera"].tolist()) for table in tables if "camera" in table.labels]
+    named = {name: table for table, names in columns for name in dict.fromkeys(names)}
     if len(named) > 1:
         told = ", ".join(name[:20] for name in named)
         raise FormatError(
