@@ -90,6 +90,7 @@ def calibrate(
     *,
     target: TargetChoice | Target = "auto",
     preferred: Model | Literal[""] = "",
+    start: Calibration | None = None,
     fix: Mapping[str, float] | None = None,
     square_pixels: bool = False,
     starts: int = _STARTS,
@@ -136,6 +137,9 @@ def calibrate(
     preferred : str
         With ``distortion="auto"``, a model to select unless another predicts decidedly better, such as that
         of the other camera of a rig.
+    start : Calibration, optional
+        Of the same points, such as on another target or with another model: it starts there, instead of from
+        random weights. Its lens and its outliers are judged again.
     fix : dict of float by name, optional
         Parameters that are known, and stay as they are: alpha_u, alpha_v, u0, v0 [px], and coefficients of a
         named distortion model.
@@ -214,7 +218,7 @@ def calibrate(
             _refuse_misfit(found)
             warnings = _unused(points, f"the method is {method}")
         else:
-            solution, rejected = _solved(problem, options, outliers, choice)
+            solution, rejected = _solved(problem, options, outliers, choice, start)
             if angle == "auto" and problem.free_camera.any() and shows_skew(solution):
                 solution, rejected = _solved(stated(True), options, outliers, choice)
             if known_target is not None:
@@ -277,14 +281,21 @@ def _angle_of(skew: bool | str, square_pixels: bool, method: str, distortion: st
     return "fixed"
 
 
-def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
+def _solved(
+    problem: Problem, options: Options, outliers: str, choice: str, start: Calibration | None = None
+) -> tuple[Solution, Rejected]:
     """Fit with the neural method and the chosen options. Imports are local: only what is needed is loaded."""
+    known = None
+    if start is not None:
+        from neurocal_cli.calibration.target_choice import solution_of
+
+        known = solution_of(start), start.rejected
     if outliers == "reject":
         from neurocal_cli.calibration.outlier_rejection import fit_robustly
 
-        solution, rejected = fit_robustly(problem, options)
+        solution, rejected = fit_robustly(problem, options, known)
     else:
-        solution, rejected = fit(problem, options), Rejected()
+        solution, rejected = fit(problem, options, known and known[0]), Rejected()
     if choice != "given":
         from neurocal_cli.calibration.rich_choice import with_rich_lens
         from neurocal_cli.calibration.target_choice import with_target

@@ -82,7 +82,8 @@ class Rejected:
     error_px: Array = field(default_factory=lambda: np.zeros(0))
     # Those that were left out as a whole, each with the reason.
     views: Mapping[str, str] = field(default_factory=dict)
-    rows: NDArray[np.intp] | None = None  # (M,) places among all points that were given, if known
+    # (M,) places among all points that were given; none if they are not known.
+    rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def __len__(self) -> int:
         return len(self.error_px)

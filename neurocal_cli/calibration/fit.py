@@ -40,11 +40,13 @@ _SKEW = 1  # place of A12 among A's entries
 
 
 @quietly  # starts that run into a pole of the distortion or into the camera's plane lose
-def fit(problem: Problem, options: Options) -> Solution:
-    """Fit a camera and its distortion model from random weights.
+def fit(problem: Problem, options: Options, known: Solution | None = None) -> Solution:
+    """Fit a camera and its distortion model from random weights, or from a known fit of the same points.
 
     Raises `DegenerateGeometryError` if the points do not determine the camera; the message says why.
     """
+    if known is not None:
+        return fit_again(known, problem.points, options, only_from_here=True)
     if options.distortion == "plumb-line":
         return _plumb_line_first(problem, options)
     if problem.free_distortion and problem.distortion.model == "rich":

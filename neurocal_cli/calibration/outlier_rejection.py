@@ -36,7 +36,7 @@ from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, odd_view
 from neurocal_cli.calibration.point_errors import FLOOR, PointErrors, largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import MISFIT, TOLD, pixel_spread
-from neurocal_cli.calibration.verdict.mistakes import error_of_view, why_odd
+from neurocal_cli.calibration.verdict.mistakes import error_of_view, located, why_odd
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.consensus import (
@@ -82,16 +82,26 @@ class _Kept:
         return _Kept(self.mask & ~_is_of(points, view), {**self.wrong_views, view: reason})
 
 
-def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected]:
+def fit_robustly(
+    problem: Problem, options: Options, known: tuple[Solution, Rejected] | None = None
+) -> tuple[Solution, Rejected]:
     """Fit a camera, leaving outliers out.
+
+    `known` is the result for the same points on nearly the same target, from which it starts.
 
     Raises `DegenerateGeometryError` if the points do not determine the camera (the message says why), or if
     at least half of them are outliers.
     """
+    if known is not None and len(known[1]):
+        before, rejected = known
+        kept = _Kept(~np.isin(np.arange(len(problem.points)), rejected.rows), rejected.views)
+        start = fit_again(before, problem.points.select(kept.mask), options, only_from_here=True)
+        kept, solution = _searched(problem.points, options, kept, start)
+        return solution, _rejected(problem.points, kept, solution)
     try:
-        first = fit(problem, options)
+        first = fit(problem, options, known and known[0])
     except DegenerateGeometryError as failure:
-        kept, solution = _searched(problem, options, None, failure)
+        kept, solution = _searched(problem.points, options, *_agreeing(problem, options, None, failure))
         if solution.spare_equations <= 0:
             raise
         return solution, _rejected(problem.points, kept, solution)
@@ -102,7 +112,7 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
     if not (contradicts or rough):
         return first, Rejected()
     try:
-        kept, solution = _searched(problem, options, first, None)
+        kept, solution = _searched(problem.points, options, *_agreeing(problem, options, first, None))
     except _NoConsensusError:  # the networks know less than the camera of all points
         if contradicts or rms(first) > MISFIT * pixel_spread(problem.points):
             raise
@@ -117,13 +127,12 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
 
 
 def _searched(
-    problem: Problem, options: Options, first: Solution | None, failure: DegenerateGeometryError | None
+    points: Correspondences, options: Options, kept: _Kept, solution: Solution
 ) -> tuple[_Kept, Solution]:
-    """The three steps; `first` is the fit of all points, or `failure` the reason why there is none."""
-    kept, solution = _agreeing(problem, options, first, failure)
-    kept, solution = _without_outlier_views(problem, options, kept, solution)
-    kept, solution = _all_judged(problem.points, options, kept, solution)
-    return _with_fitting_views(problem, options, kept, solution)
+    """The steps after the first one, from the fit of the points that agree."""
+    kept, solution = _without_outlier_views(points, options, kept, solution)
+    kept, solution = _all_judged(points, options, kept, solution)
+    return _with_fitting_views(points, options, kept, solution)
 
 
 def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:
@@ -254,13 +263,12 @@ def _refuse_few(points: Correspondences, kept: _Kept, failure: DegenerateGeometr
 
 
 def _without_outlier_views(
-    problem: Problem, options: Options, kept: _Kept, solution: Solution
+    points: Correspondences, options: Options, kept: _Kept, solution: Solution
 ) -> tuple[_Kept, Solution]:
     """Leave out views of another camera, or of another target than their points say, one by one."""
-    points = problem.points
     while (outlier := _outlier_view(points, kept, solution)) is not None:
         kept = kept.without(points, outlier)
-        solution = _fitted(problem, kept.mask, options)
+        solution = fit_again(solution, points.select(kept.mask), options, only_from_here=True)
     return kept, solution
 
 
@@ -280,7 +288,7 @@ def _all_judged(
         if (kept.mask == last.mask).all():
             break
         _refuse_few(points, kept)
-        near = int((kept.mask != last.mask).sum()) <= _LITTLE * int(last.mask.sum())
+        near = int((last.mask & ~kept.mask).sum()) <= _LITTLE * int(last.mask.sum())
         solution = fit_again(solution, points.select(kept.mask), options, only_from_here=near)
         if kept.mask.tobytes() in known:  # a cycle: a point near the limit is alternately kept and rejected
             break
@@ -289,21 +297,23 @@ def _all_judged(
 
 
 def _with_fitting_views(
-    problem: Problem, options: Options, kept: _Kept, solution: Solution
+    points: Correspondences, options: Options, kept: _Kept, solution: Solution
 ) -> tuple[_Kept, Solution]:
     """Take back the views that fit the final camera: their networks, or an earlier camera, knew less."""
-    points, usual, fitting = problem.points, rms(solution) ** 2, []
+    usual, fitting = rms(solution) ** 2, []
     for name in kept.wrong_views:
         one = points.select(_is_of(points, name))
         chance = 1 + TOLD * np.sqrt(2.0 / max(2 * len(one) - 6, 1))
         if error_of_view(one, solution.camera) ** 2 <= chance * usual:
             fitting.append(name)
-    if not fitting:
-        return kept, solution
     mask = kept.mask | np.isin(points.view_index, [points.view_names.index(name) for name in fitting])
+    posed = located(points.select(mask), solution.camera) if fitting else None
+    if posed is None:
+        return kept, solution
     wrong = {name: why for name, why in kept.wrong_views.items() if name not in fitting}
+    start = Solution(solution.problem.with_points(posed.problem.points), posed.adjusted, posed.record)
     try:
-        more = _fitted(problem, mask, options)
+        more = fit_again(start, points.select(mask), options, only_from_here=True)
         found = _all_judged(points, options, _Kept(mask, wrong), more)
     except DegenerateGeometryError:
         return kept, solution

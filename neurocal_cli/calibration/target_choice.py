@@ -35,7 +35,7 @@ from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
-from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_intrinsics
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
@@ -104,6 +104,18 @@ def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
     problem = replace(problem, fixed=problem.fixed | calibration.fixed)
     state = calibration.state(problem.views.names)
     return problem, problem.adjust(normalised(state, problem.views))
+
+
+def solution_of(calibration: Calibration) -> Solution:
+    """The solution that a calibration was made of, to start from; of the method neuro."""
+    problem, adjusted = _fit(calibration)
+    of, n, px = calibration.network, len(problem.points), problem.views.pixel_scale
+    assert of is not None
+    record = TrainingRecord(
+        np.full(problem.views.n_views, of.agreed), of.starts, of.iterations,
+        (of.loss / px) ** 2 * n, (of.rmse_before / px) ** 2 * n, np.array(of.curve) / px,
+    )  # fmt: skip
+    return Solution(problem, adjusted, record)
 
 
 def find_shape(
@@ -277,8 +289,9 @@ def _fitted_to(
 ) -> tuple[Solution, Rejected] | None:
     """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
     try:
-        if len(rejected) or rejected.views:
-            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
+        if len(rejected):
+            seen = problem.with_points(target.seen(problem.points))
+            again, rejected = fit_robustly(seen, options, (solution, rejected))
         else:  # the solution has all points, where the target has them
             again = fit_again(solution, solution.problem.points, options, only_from_here=True)
     except DegenerateGeometryError:
@@ -372,17 +385,14 @@ def _surveyed(
 ) -> tuple[Solution, Rejected]:
     """Adjust camera and points; outliers are judged by `factor` times the stated standard deviations."""
     points = problem.points
-    judged = replace(points, covariance=_with_places(solution, points, factor), lines=np.arange(len(points)))
-    if len(rejected) or rejected.views:
+    judged = replace(points, covariance=_with_places(solution, points, factor))
+    if len(rejected):
         weighed, rejected = fit_robustly(problem.with_points(judged), options)
-        if rejected.points is not None:
-            assert rejected.points.lines is not None
-            rejected = replace(rejected, points=points.select(rejected.points.lines))
+        if len(rejected):
+            rejected = replace(rejected, points=points.select(rejected.rows))
     else:
         weighed = fit_again(solution, judged, options)
-    kept = weighed.problem.points.lines
-    assert kept is not None
-    own = weighed.problem.with_points(points.select(kept))
+    own = weighed.problem.with_points(points.select(np.delete(np.arange(len(points)), rejected.rows)))
     if not own.free_distortion:
         own = own.with_seen_pixels()
     start = own.adjust(replace(weighed.adjusted, state=normalised(weighed.in_pixels, own.views)))

@@ -140,6 +140,7 @@ _TIE = 1e-4  # relative difference within which two costs are equal
 # With hardly more equations than unknowns several minima fit well, and two starts may agree on a wrong one.
 # So this many starts are always trained, side by side, before their results are compared.
 _BATCH = 48
+_POSE_STEPS = 50  # of a pose: starts that have not settled by then are not at the best minimum
 
 
 @frozen_dataclass(eq=False)
@@ -163,7 +164,7 @@ def find_poses(
     many = patterns.take(np.repeat(np.arange(len(which)), starts))
     R = nearest_rotation(rng.uniform(-1, 1, (len(many.weights), 3, 3)))
     state = CameraState(entries, R, _translation(entries, R, many))
-    adjusted = adjust(_as_batches(many), state, np.zeros(5, dtype=bool))
+    adjusted = adjust(_as_batches(many), state, np.zeros(5, dtype=bool), max_iterations=_POSE_STEPS)
     cost = adjusted.cost.reshape(len(which), starts)
     best = cost.argmin(axis=1)
     lowest = cost[np.arange(len(which)), best]

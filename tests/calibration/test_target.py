@@ -177,6 +177,24 @@ def test_two_cameras_find_one_target() -> None:
     assert rig.rmse_px < 0.5 * given.rmse_px
 
 
+def test_a_calibration_goes_on_from_another_ones_camera_and_outliers_on_another_target() -> None:
+    points, target = read_points(str(SAMPLE)), bent().target
+    assert target is not None
+    pixels = points.pixels.copy()
+    pixels[::40] += 15.0
+    wrong = replace(points, pixels=pixels)
+    given = calibrate(wrong, target="given", skew=False)
+    anew, goes_on = (calibrate(wrong, target=target, skew=False, start=start) for start in (None, given))
+    for name in ("alpha_u", "alpha_v", "u0", "v0"):
+        one, other = (getattr(camera.intrinsics, name) for camera in (goes_on, anew))
+        assert one == pytest.approx(other, abs=0.01 * anew.std[name])
+    assert goes_on.rejected.rows.tolist() == anew.rejected.rows.tolist() == list(range(0, len(points), 40))
+    # It is not trained again.
+    assert given.network is not None
+    assert goes_on.network is not None
+    assert goes_on.network.starts == given.network.starts
+
+
 def test_other_methods_take_the_target_as_given() -> None:
     left, right = photographed_pair(5)
     rig = calibrate_stereo(left, right, method="linear", skew=False)

@@ -95,14 +95,14 @@ def cameras_on_one_target(
     names = list(points)
     choice = options[names[0]].get("target", "auto")
 
-    def camera(name: str, target: str | Target, preferred: str = "") -> Calibration:
-        own = {"camera_name": name, **options[name], "target": target, "preferred": preferred}
+    def camera(name: str, target: str | Target, start: Calibration | None, model: str = "") -> Calibration:
+        own = {"camera_name": name, **options[name], "target": target, "preferred": model, "start": start}
         return calibrate(points[name], **own, progress=_named(progress, name))
 
-    def calibrated(target: str | Target) -> list[Calibration]:
-        cameras = [camera(name, target) for name in names]
+    def calibrated(target: str | Target, starts: Sequence[Calibration | None]) -> list[Calibration]:
+        cameras = [camera(name, target, start) for name, start in zip(names, starts, strict=True)]
         for k, model in _likely_models(cameras):
-            alike = camera(names[k], target, model)
+            alike = camera(names[k], target, cameras[k], model)
             if alike.distortion_model == model:
                 cameras[k] = alike
                 if len(cameras) == 2:
@@ -110,14 +110,14 @@ def cameras_on_one_target(
         return cameras
 
     surveyed = any(one.world_std is not None for one in points.values())
-    cameras = calibrated(choice if surveyed else "given")
+    cameras = calibrated(choice if surveyed else "given", [None] * len(names))
     target: Target | None = None
     for _ in range(_ROUNDS):
         before, target = target, common_target(cameras, choice)
         if target is None or (before is not None and target.moved_from(before) < _SETTLED):
             break
         models = [camera.distortion_model for camera in cameras]
-        cameras = calibrated(target)
+        cameras = calibrated(target, cameras)
         if [camera.distortion_model for camera in cameras] == models:
             break
     kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)

@@ -204,7 +204,7 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     """
     if not arrange(points).nearly_flat.all() or len(points) < 6:
         return otherwise
-    limit, plain = _HOLDS * rmse_px, _posed(points, camera)
+    limit, plain = _HOLDS * rmse_px, located(points, camera)
     mistakes = [
         (f"its {one.say(points)[0]}", error_of_view(mended, camera), one.pixel)
         for one in MISTAKES
@@ -245,11 +245,11 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
 
 def error_of_view(points: Correspondences, camera: Camera) -> float:
     """Rms error [px] of one view's points with their pose fitted; infinite if that fails."""
-    posed = _posed(replace(points, covariance=None, across=None), camera)
+    posed = located(replace(points, covariance=None, across=None), camera)
     return np.inf if posed is None else rms(posed)
 
 
-def _posed(points: Correspondences, camera: Camera) -> Solution | None:
+def located(points: Correspondences, camera: Camera) -> Solution | None:
     """The view's pose with the camera; None if it cannot be estimated."""
     try:
         problem = problem_for(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)

@@ -275,7 +275,7 @@ def with_rejected(calibration: Calibration) -> Correspondences:
     if lost is None:
         return kept
     n = len(kept) + len(lost)
-    order = np.arange(n) if rows is None else np.argsort(np.append(np.delete(np.arange(n), rows), rows))
+    order = np.arange(n) if not rows.size else np.argsort(np.append(np.delete(np.arange(n), rows), rows))
     names = [np.array(part.view_names)[part.view_index] for part in (kept, lost)]
     return Correspondences(
         np.concatenate([kept.world, lost.world])[order],
