@@ -283,11 +283,9 @@ def open_stretch(found: Covariance, m: Minimum, world: Array, variance: float) -
 
     The first columns are those of the free parameters of the camera, which is at its minimum for the given
     target. The variance is that of the residuals, enlarged if they are correlated. The covariance stays as it
-    is, and the probability is 0, if the stretch is negligible, and for one view of a target that is not flat:
-    in it, a stretched target is another camera.
+    is, and the probability is 0, if the stretch is negligible, and for one view, or one frame of a rig, of a
+    target that is not flat: in it, a stretched target is other cameras.
     """
-    if m.views.n_views == 1 and not is_flat(world):
-        return found, 0.0
     by = stretches(world)
     normal = stretched_blocks(m.views.batches, m.state, by)
     arrow = replace(m, normal=normal, free=np.append(m.free, np.ones(len(by), dtype=bool))).arrow
@@ -301,9 +299,9 @@ def with_stretch(
 
     `place` are the columns of these parameters in the covariance.
     """
-    n = len(arrow.shared) - 1
+    n, views = len(arrow.shared) - 1, len(arrow.own)
     spread = spread_of_stretch(arrow, variance, n - len(place))
-    if spread is None:
+    if spread is None or (views == 1 and len(spread.E) > 2):
         return found, 0.0
     is_stretch = np.arange(n) >= len(place)
     return opened(found, place, arrow, spread, is_stretch)[0], spread.probability

@@ -93,8 +93,6 @@ class Solution:
     common_noise: float = 0.0
     # Cross-validation errors of the candidate models of ``distortion="auto"``, by distortion model [px].
     model_errors: Mapping[str, float] | None = None
-    # Models that one of these selections would have chosen, had they been preferred.
-    would_take: frozenset[str] = frozenset()
     # The straight lines from which ``distortion="plumb-line"`` estimated the distortion.
     straight_lines: StraightLines | None = None
     # The target if it was estimated with the camera; the problem's points are then those of the target.
@@ -211,7 +209,7 @@ def restarted(solution: Solution, points: Correspondences) -> Solution:
     """Adjust a solution to other points of the same views, or of some of them."""
     known = solution.problem
     if points is known.points and points.covariance is None and known.penalty is None:  # it is there already
-        return Solution(known, solution.adjusted, solution.record, would_take=solution.would_take)
+        return Solution(known, solution.adjusted, solution.record)
     problem = known.with_points(points)
     if not problem.free_distortion:
         problem = problem.with_seen_pixels()
@@ -220,7 +218,6 @@ def restarted(solution: Solution, points: Correspondences) -> Solution:
         problem,
         problem.adjust(replace(solution.adjusted, state=_start(problem, solution))),
         replace(solution.record, agreed=solution.record.agreed[place]),
-        would_take=solution.would_take,
     )
 
 

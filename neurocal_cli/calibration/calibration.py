@@ -130,9 +130,6 @@ class Calibration(Presented):
         The verdict read from a file, or the function that computes it from this calibration; see `verdict`.
     lens_choice : dict of float by distortion model [px]
         The candidate models of ``distortion="auto"`` and their cross-validation errors.
-    would_take : frozenset of str
-        Distortion models that would have been selected if they were `preferred`; any other preference has no
-        effect. Not in files.
     covariance : (n, n) array
         Of the free intrinsic parameters, in the order of `covariance_names`; `views` holds the standard
         deviations of the poses.
@@ -172,7 +169,6 @@ class Calibration(Presented):
     second_poses: Mapping[str, ViewResult] = field(default_factory=dict)
     target_stretched: float = 0.0
     square_pixels: bool = False
-    would_take: frozenset[str] = frozenset()
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
 
     _summary = ("commands.show.camera_report", "calibration_report")

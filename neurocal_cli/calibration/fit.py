@@ -100,7 +100,7 @@ def _with_selected_model(solution: Solution, options: Options, only_from_here: b
     turned = _turned(found)
     if turned is found:
         return found
-    again = replace(solution, adjusted=turned.adjusted, would_take=found.would_take)
+    again = replace(solution, adjusted=turned.adjusted)
     return select_model(again, more_starts, options.preferred)
 
 

@@ -113,7 +113,6 @@ def calibration_of(
         target=solution.target,
         target_stretched=known.stretched,
         lens_choice=solution.model_errors or {},
-        would_take=solution.would_take,
         warnings=(
             *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
             *_lens_warnings(solution),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.campaign import scene
-from support.rigs import random_rig, stereo_problem
+from support.rigs import corner, random_rig, stereo_problem
 from support.scenes import random_rotation
 from support.targets import photographed
 
@@ -20,6 +20,7 @@ from neurocal_cli.adjustment.open_choices import SpreadOfOpen, open_stretch, spr
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.rig.adjust import adjust_rig
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.covariance import with_stretch_of
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.camera.distortion import Distortion
@@ -101,6 +102,18 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     tau = (new.view_t - adjusted.state.view_t) / EPS
     std = np.sqrt(np.diagonal(found.own[:, 3:, 3:], axis1=1, axis2=2))
     assert std == pytest.approx(np.abs(tau), rel=5e-3, abs=1e-3)
+
+
+def test_in_one_frame_of_a_rig_a_stretched_folded_target_is_other_cameras() -> None:
+    rng = np.random.default_rng(0)
+    scene = random_rig(rng, "verging", 1, target=corner())
+    left, right = (scene.points(side, 0.2, rng) for side in (0, 1))
+    chosen, given = (
+        calibrate_stereo(left, right, skew=False, distortion="none", target=how) for how in ("auto", "given")
+    )
+    assert chosen.left.target is None
+    assert chosen.std == given.std
+    assert chosen.left.std == given.left.std
 
 
 def test_the_spread_is_that_of_all_models() -> None:

@@ -86,7 +86,6 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
         solution,
         problem=chosen.problem,
         adjusted=replace(chosen.adjusted, iterations=iterations),
-        would_take=solution.would_take | (good - {name}),
         model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
     )
 

@@ -146,7 +146,6 @@ def _likely_models(cameras: Sequence[Calibration]) -> list[tuple[int, str]]:
         for k, camera in enumerate(cameras)
         if wanted[k] != models[k]
         and math.isfinite(loss(k))
-        and wanted[k] in camera.would_take
         and (len(cameras) == 2 or (wanted[k] in WIDE) == camera.camera.distortion.wide)
     ]
     return [(k, wanted[k]) for k in sorted(could, key=loss)]

@@ -293,7 +293,7 @@ def test_cameras_are_calibrated_anew_only_on_a_target_that_moved(
 
     def one(points: Correspondences, **options: object) -> SimpleNamespace:
         done.append(options["target"])
-        return SimpleNamespace(distortion_model=next(models), target=None, lens_choice={}, would_take=())
+        return SimpleNamespace(distortion_model=next(models), target=None, lens_choice={})
 
     monkeypatch.setattr(calibrate_rig, "calibrate", one)
     monkeypatch.setattr(calibrate_rig, "common_target", lambda cameras, choice: next(found))
