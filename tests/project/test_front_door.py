@@ -60,7 +60,7 @@ def test_the_types_of_options_list_what_there_is() -> None:
 
 
 def test_options_of_rigs_are_those_of_a_camera() -> None:
-    own = {"points", "camera_name", "progress"}
+    own = {"points", "camera_name", "progress", "start"}
     assert set(CameraOptions.__annotations__) == set(signature(calibrate).parameters) - own
 
 
