@@ -113,10 +113,11 @@ def predicted_pixels(
 
     Returns the pixels (N, 2), and which points (N,) are in front of the camera; others have ``nan`` pixels.
     """
-    X, Y, Z = ((state.R[view] @ world[..., None])[..., 0] + state.t[view]).T
+    X, Y, Z = np.moveaxis(state.R[view] @ world[..., None] + state.t[view][..., None], 1, 0)
+    entries, k = state.camera_of(view)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u, v, seen = project_points(state.entries[0], state.model, state.k, X, Y, Z)
-        return np.where(seen[:, None], np.column_stack([u, v]), np.nan), seen
+        u, v, seen = project_points(entries, state.model, k, X, Y, Z)
+        return np.where(seen, np.column_stack([u, v]), np.nan), seen[:, 0]
 
 
 def farthest_angle(views: Views, state: CameraState) -> float:

@@ -19,6 +19,7 @@ from itertools import product
 import numpy as np
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
+from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.zoom.parameter_networks import are_cameras, local_to_outputs, outputs_to_local
 from neurocal_cli.calibration.zoom.settings import (
@@ -37,8 +38,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics, entries_of
-from neurocal_cli.camera.projection import image_points
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, NeurocalError
 
 _HIGHEST_DEGREE = 6
@@ -159,18 +159,9 @@ def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Co
 
 def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Constants) -> Array:
     """(N,) squared pixel errors; nan for points that are not in front of the camera."""
-    p = local[points.point_setting]
-    world, pixels, view = points.points.world, points.points.pixels, points.points.view_index
-    if lens.still:
-        camera = world @ constants.R.T + np.column_stack([np.tile(constants.t, (len(p), 1)), p[:, 4]])
-    else:
-        camera = np.einsum("nij,nj->ni", constants.R[view], world) + constants.t[view]
-    depth = np.where(camera[:, 2] > 0, camera[:, 2], np.nan)
-    image_x, image_y = camera[:, 0] / depth, camera[:, 1] / depth
-    k = coefficients_of(p, lens.model).T
-    entries = entries_of(p[:, 0], p[:, 1], p[:, 2], p[:, 3], constants.theta)
-    u, v = image_points(entries, lens.model, k, image_x, image_y)
-    return np.asarray((u - pixels[:, 0]) ** 2 + (v - pixels[:, 1]) ** 2)
+    state = PixelData(points, lens.still, lens.model, lens.free_theta).in_pixels(local, constants)
+    seen, _ = predicted_pixels(state, points.points.world, points.points.view_index)
+    return np.asarray(((seen - points.points.pixels) ** 2).sum(axis=1))
 
 
 def _rms(squares: Array) -> float:

@@ -272,16 +272,20 @@ class PixelData:
 
     def state_of(self, local: Array, constants: Constants) -> CameraState:
         """Normalised cameras of all views."""
-        views, local = self.views, local[self.setting]
+        return normalised(self.in_pixels(local, constants), self.views)
+
+    def in_pixels(self, local: Array, constants: Constants) -> CameraState:
+        """Cameras of all views in pixels and world units."""
+        V, local = self.lens.points.n_views, local[self.setting]
         a, b, u0, v0 = local[:, :4].T
         sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
         A = np.column_stack([a, -a * cosine / sine, b / sine, u0, v0])
         if self.still:
-            R = np.broadcast_to(constants.R, (views.n_views, 3, 3))
-            t = np.column_stack([np.tile(constants.t, (views.n_views, 1)), local[:, 4]])
+            R = np.broadcast_to(constants.R, (V, 3, 3))
+            t = np.column_stack([np.tile(constants.t, (V, 1)), local[:, 4]])
         else:
             R, t = constants.R, constants.t
-        return normalised(CameraState(A, R, t, self.model, coefficients_of(local, self.model)), views)
+        return CameraState(A, R, t, self.model, coefficients_of(local, self.model))
 
     def camera_jacobian(self, local: Array, constants: Constants) -> Array:
         """Derivatives (V, 5 + K, 5 + K) of A's normalised entries and the distortion coefficients.

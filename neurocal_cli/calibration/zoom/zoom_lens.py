@@ -312,7 +312,6 @@ def camera_at(
     lens: ZoomLens,
     setting: Array,
     camera_name: str = "camera",
-    warnings: tuple[str, ...] = (),
     *,
     extrapolate: bool = False,
 ) -> Calibration:
@@ -324,8 +323,6 @@ def camera_at(
     setting : (D,) array
         In the order of the lens's controls.
     camera_name : str
-    warnings : tuple of str
-        Stored in the calibration.
     extrapolate : bool
         Whether a setting outside the calibrated range gives a warning and not an error.
 
@@ -369,7 +366,7 @@ def camera_at(
         covariance=prediction.covariance[0][np.ix_(order, order)],
         covariance_names=tuple(free),
         camera_name=camera_name,
-        warnings=(*warnings, *outside),
+        warnings=tuple(outside),
     )
 
 
