@@ -158,7 +158,7 @@ class Sightings:
         for camera, mine in zip(self.cameras, self.rows, strict=True):
             own, point = inside[mine], self.point[mine]
             projected, fine = camera.project(own)
-            J = camera.project_jacobian(own)[1] @ by[mine]
+            J = camera.project_jacobian(own)[1] @ by[mine] if by.size else by[mine, :2]
             J = np.concatenate([J, (self.pixels[mine] - projected)[..., None]], axis=2)
             J = J if self.whitening is None else self.whitening[mine] @ J
             N[point] += np.swapaxes(J, 1, 2) @ J

@@ -19,7 +19,6 @@ from typing import Any, Literal, get_args, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.cross_validation import solve_or_nan
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.many_views import Sightings
 from neurocal_cli.calibration.rig.rectification import rectify
@@ -196,11 +195,13 @@ def _midpoint(seen: Sightings) -> Array:
     """(n, 3) the points with the smallest sum of squared distances from both rays."""
     R, t = seen.poses[seen.pose, :, :3], seen.poses[seen.pose, :, 3:]
     back = np.swapaxes(R, 1, 2)
-    rays = back @ seen.rays[..., None]
-    across = np.eye(3) - rays * np.swapaxes(rays, 1, 2)
-    left, right = np.split(np.concatenate([across, across @ (-back @ t)], axis=2), 2)
-    both = left + right
-    return solve_or_nan(both[:, :, :3], both[:, :, 3])
+    (left, right), (first, second) = (
+        np.split(a[..., 0], 2) for a in (back @ seen.rays[..., None], -back @ t)
+    )
+    n = np.cross(left, right)
+    # To the feet of the common perpendicular, times the square of the sine between the rays.
+    s, u = ((np.cross(second - first, ray) * n).sum(axis=1, keepdims=True) for ray in (right, left))
+    return np.asarray(0.5 * (first + second + (s * left + u * right) / (n * n).sum(axis=1, keepdims=True)))
 
 
 def _linear(seen: Sightings, wide: bool) -> Array:

@@ -156,12 +156,10 @@ def _train_and_reject(
     start: CalibratedSettings, options: FitOptions
 ) -> tuple[CalibratedSettings, list[Joint]]:
     """Steps 2 and 3, with rejection of settings that contradict all others."""
-    while True:
-        joints = _trained(start, options)
-        rest = _without_odd(start, joints, options) if options.reject else None
-        if rest is None:
-            return start, joints
-        start = rest
+    joints = _trained(start, options)
+    while options.reject and (rest := _without_odd(start, joints, options)) is not None:
+        start, joints = rest, _trained(rest, options)
+    return start, joints
 
 
 def _without_odd(
