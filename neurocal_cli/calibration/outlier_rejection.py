@@ -76,11 +76,6 @@ class _Kept:
     mask: NDArray[np.bool_]  # (N,) which points are kept
     wrong_views: Mapping[str, str]  # left out as a whole, each with the reason
 
-    def without(self, points: Correspondences, view: str) -> _Kept:
-        """Leave out a view that contradicts the camera of the others."""
-        reason = "it contradicts the camera of the other views"
-        return _Kept(self.mask & ~_is_of(points, view), {**self.wrong_views, view: reason})
-
 
 def fit_robustly(
     problem: Problem, options: Options, known: tuple[Solution, Rejected] | None = None
@@ -265,17 +260,16 @@ def _refuse_few(points: Correspondences, kept: _Kept, failure: DegenerateGeometr
 def _without_outlier_views(
     points: Correspondences, options: Options, kept: _Kept, solution: Solution
 ) -> tuple[_Kept, Solution]:
-    """Leave out views of another camera, or of another target than their points say, one by one."""
-    while (outlier := _outlier_view(points, kept, solution)) is not None:
-        kept = kept.without(points, outlier)
+    """Leave out views of another camera, or of another target than their points say, one by one.
+
+    At most a third of the views are left out.
+    """
+    most = (points.n_views - 1) // 3
+    while len(kept.wrong_views) < most and (odd := odd_view(solution)) is not None:
+        wrong = {**kept.wrong_views, odd: "it contradicts the camera of the other views"}
+        kept = _Kept(kept.mask & ~_is_of(points, odd), wrong)
         solution = fit_again(solution, points.select(kept.mask), options, only_from_here=True)
     return kept, solution
-
-
-def _outlier_view(points: Correspondences, kept: _Kept, solution: Solution) -> str | None:
-    """The view that contradicts the others most; None if there is none, or a third is left out already."""
-    most = (points.n_views - 1) // 3
-    return odd_view(solution) if len(kept.wrong_views) < most else None
 
 
 def _all_judged(

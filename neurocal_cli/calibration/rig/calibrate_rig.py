@@ -22,7 +22,6 @@ from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.target_choice import can_tell, common_target, on_one_target
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, UsageError, check_kind, plural
 from neurocal_cli.network.options import Progress
@@ -37,19 +36,6 @@ _ROUNDS = 2  # rounds of selecting lenses and target alternately
 # that are at most 2 % larger, and the common adjustment still moves it.
 _SETTLED = 0.2
 _OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
-
-
-@frozen_dataclass(eq=False)
-class SeveralCameras:
-    """Calibrated cameras by name."""
-
-    cameras: Mapping[str, Calibration]
-    target_kept: bool  # whether the given target was kept although it could have been estimated
-
-    @property
-    def refinable(self) -> bool:
-        """Whether a common bundle adjustment may refine the cameras."""
-        return all(camera.method in _OF_LEAST_SQUARES for camera in self.cameras.values())
 
 
 def check_options(options: Mapping[str, Mapping[str, Any]]) -> None:
@@ -87,9 +73,10 @@ def cameras_on_one_target(
     points: Mapping[str, Correspondences],
     options: Mapping[str, Mapping[str, Any]],
     progress: Progress | None,
-) -> SeveralCameras:
+) -> tuple[dict[str, Calibration], bool]:
     """Calibrate cameras on one target, which is estimated from all of them if the points support that.
 
+    The second result is whether the given target was kept although it could have been estimated.
     `points` and `options`, the arguments of `calibrate`, are by the name of the camera.
     """
     names = list(points)
@@ -121,7 +108,7 @@ def cameras_on_one_target(
         if [camera.distortion_model for camera in cameras] == models:
             break
     kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
-    return SeveralCameras(dict(zip(names, cameras, strict=True)), kept)
+    return dict(zip(names, cameras, strict=True)), kept
 
 
 def _likely_models(cameras: Sequence[Calibration]) -> list[tuple[int, str]]:
@@ -217,21 +204,23 @@ def calibrate_rig(
         )
     if several:
 
-        def fitted(some: Mapping[str, Correspondences], target: TargetChoice | Target) -> SeveralCameras:
+        def fitted(
+            some: Mapping[str, Correspondences], target: TargetChoice | Target
+        ) -> tuple[dict[str, Calibration], bool]:
             with_target = {name: {**own, "target": target} for name, own in of_each.items()}
             return cameras_on_one_target(some, with_target, progress)
 
         choice = next(iter(of_each.values())).get("target", "auto")
-        found, about_boards = arranged(points, choice, fitted, lambda fit: fit.cameras)
+        (cameras, kept), about_boards = arranged(points, choice, fitted, lambda fit: fit[0])
         told += about_boards
     else:
         connected_frames(points)  # errors are reported before the training
-        found = cameras_on_one_target(points, of_each, progress)
+        cameras, kept = cameras_on_one_target(points, of_each, progress)
     rig = fit_rig(
-        found.cameras,
-        refine_cameras=found.refinable,
+        cameras,
+        refine_cameras=all(camera.method in _OF_LEAST_SQUARES for camera in cameras.values()),
         outliers=options.get("outliers", "reject"),
-        target_kept=found.target_kept,
+        target_kept=kept,
     )
     own = told_once({name: camera.warnings for name, camera in rig.cameras.items()})
     return replace(rig, warnings=(*told, *rig.warnings, *dict.fromkeys(own.values())))
