@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, nearest_similarity, similarity
 from neurocal_cli.detection.circles.lattice import PlacedCircles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink
@@ -290,10 +290,7 @@ def _box(cols: int, rows: int) -> list[list[int]]:
 
 def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
     """R and t with ``second = first R^T + t`` for points (N, 3), R a rotation; None if no motion fits."""
-    a, b = first.mean(axis=0), second.mean(axis=0)
-    U, _, Vt = np.linalg.svd((first - a).T @ (second - b))
-    R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
-    t = b - R @ a
+    _, R, t = nearest_similarity(first, second)
     misses = np.abs(first @ R.T + t - second).max()
     return (R, t) if misses <= _ROUNDING * max(float(np.ptp(first)), 1e-300) else None
 
@@ -341,26 +338,19 @@ def _plane_coordinates(world: Array, front: Array | None) -> Array:
 
 def _linear_camera(points: Array, pixels: Array) -> tuple[Array, float]:
     """Projection matrix (3, d + 1) from points (N, d) to pixels, and its rms error [px]."""
-    T, x = _scaled(points)
-    S, d = _scaled(pixels)
+    (middle, size), (centre, scale) = similarity(points), similarity(pixels)
+    x = np.column_stack([(points - middle) / size, np.ones(len(points))])
+    d = (pixels - centre) / scale
     zeros = np.zeros_like(x)
-    rows = np.concatenate([np.hstack([x, zeros, -d[:, :1] * x]), np.hstack([zeros, x, -d[:, 1:2] * x])])
-    normal = np.linalg.eigh(rows.T @ rows)[1][:, 0]
-    P = np.linalg.inv(S) @ normal.reshape(3, -1) @ T
+    rows = np.concatenate([np.hstack([x, zeros, -d[:, :1] * x]), np.hstack([zeros, x, -d[:, 1:] * x])])
+    P = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, -1)
+    P[:2] = scale * P[:2] + centre[:, None] * P[2]
+    P[:, :-1] /= size
+    P[:, -1] -= P[:, :-1] @ middle
     seen = np.column_stack([points, np.ones(len(points))]) @ P.T
     with np.errstate(divide="ignore", invalid="ignore"):
         error = seen[:, :2] / seen[:, 2:] - pixels
     return P, _rms(error)
-
-
-def _scaled(points: Array) -> tuple[Array, Array]:
-    """Matrix that centres and scales points, and the scaled homogeneous points."""
-    centre = points.mean(axis=0)
-    size = float(np.sqrt(((points - centre) ** 2).mean())) or 1.0
-    d = points.shape[1]
-    T = np.eye(d + 1) / size
-    T[:d, d], T[d, d] = -centre / size, 1.0
-    return T, np.column_stack([(points - centre) / size, np.ones(len(points))])
 
 
 def _rms(error: Array) -> float:

@@ -352,12 +352,6 @@ def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) ->
             shape,
         )
     may_be_a_part = len(board.planes) == 1 and _fits(shape, board.planes[0])
-    if may_be_a_part and surrounded(ends) and set(ends.values()) != {End.BOARD}:
-        return NoBoardError(
-            f"detected {_size(shape)} inner vertices with ends on all sides, but the board has {wanted}; "
-            "give the size of the board in the image, or show the whole board, evenly lit",
-            shape,
-        )
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
     return NoBoardError(
         f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "

@@ -34,11 +34,8 @@ from neurocal_cli.detection.markers.numbering import (
     lie_of,
     numbered,
 )
-from neurocal_cli.detection.markers.reading import (
-    Marks,
-    numbers_in,
-    read_codes,
-)
+from neurocal_cli.detection.markers.reading import Marks, numbers_in, read_codes
+from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import TagPlane
@@ -259,8 +256,8 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
     assert markers is not None
     if isinstance(plane, TagPlane):
         tags = [part for image, marks in images if (part := _best(plane, image, marks)) is not None]
-        spacing = _median(
-            [_spacing(replace(plane, spacing=one), pixels) for one, (pixels, _, _) in tags], np.nan
+        spacing = median(
+            np.array([_spacing(replace(plane, spacing=one), pixels) for one, (pixels, _, _) in tags])
         )
         if not np.isfinite(spacing):
             size = "x".join(map(str, plane.tags))
@@ -274,7 +271,7 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
     rough, width = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
     seen = [picture for image, marks in images if (picture := _pictured(plane, image, marks)) is not None]
     found = [_side(picture, rough, width) for picture in seen]
-    side, blur = (_median([one[k] for one in found], np.nan) for k in (0, 1))
+    side, blur = (median(np.array([one[k] for one in found])) for k in (0, 1))
     if np.isfinite(side):
         ratio = simple(side, min(_CLOSE_SIDE + _CLOSE_BLURRED * blur, _CLOSEST))
     else:
@@ -323,11 +320,6 @@ def simple(ratio: float, close: float) -> float:
         if abs(above / below - ratio) < min(close, _CLOSE_SPACING):
             return round(above / below, 6)
     return round(ratio, _DIGITS)
-
-
-def _median(found: Sequence[float], otherwise: float) -> float:
-    known = [one for one in found if np.isfinite(one)]
-    return float(np.median(known)) if known else otherwise
 
 
 def _pictured(plane: Plane, image: NDArray[np.generic], marks: Marks) -> _Picture | None:
