@@ -75,16 +75,17 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
 
 
 def _is_covered(light: NDArray[np.bool_], profile: Array, margin: float) -> bool:
-    """Whether something hides the rest: it cuts squares of the ring, or some of the next ones are seen.
+    """Whether something hides the rest: it cuts squares of the ring, or leaves the next ones in part.
 
-    The margin, which is known from other sides, is not seen.
+    The margin, which is known from other sides, is not seen. A window on a screen leaves parts of all.
     """
     beyond, past = profile[:, _BEYOND].mean(axis=1), profile[:, _PAST]
     before = _crossings(profile, light.astype(float), beyond) < 1 - _AT_THE_LINE
     cut = before & (np.abs(beyond - light) > _SAME)
-    turned = past[~light].max(axis=0, initial=0) - past[light].min(axis=0, initial=1)
+    turned = past[~light].max(axis=0, initial=0) - past[light].min(axis=0, initial=1) > _DIFFERENT
+    some = turned & (np.abs(past - beyond[:, None]) < 0.5 * _SAME).any(axis=0)
     away = np.abs(beyond - margin) > _SAME
-    return bool(away.mean() >= _SHARE and (cut.any() or turned.max() > _DIFFERENT))
+    return bool(away.mean() >= _SHARE and (cut.any() or some.any()))
 
 
 def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:

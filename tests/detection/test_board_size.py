@@ -203,6 +203,12 @@ def test_the_border_of_a_shadow_is_no_end_of_the_board(real_files: RealFiles) ->
         found_board([image])
 
 
+def test_a_window_that_cuts_a_row_of_squares_is_the_end_of_a_board_on_a_screen(real_files: RealFiles) -> None:
+    (image,) = map(grey, real_files("photographs/sharpened_screen.jpg"))
+    (located,) = identify(Board.single(9, 6, 25.0), find_grids(image, [(9, 6)]), image).located
+    assert located.grid.shape == (6, 7)
+
+
 def in_shadow(light: float) -> tuple[np.ndarray, Grid]:
     """A board in a shadow that begins at its fifth line, and the grid of the four lines before it."""
     image = np.array(picture("tilt 0", 0).image, dtype=float)
