@@ -343,7 +343,7 @@ def window(half: int, width: int) -> NDArray[np.intp]:
     return (offset[:, None] * width + offset).ravel()
 
 
-def interpolate(image: Image, points: NDArray[np.floating]) -> Array:
+def interpolate(image: NDArray[np.uint8] | Image, points: NDArray[np.floating]) -> Array:
     """Interpolate an image linearly at points (..., 2) [px], repeating the border outside."""
     flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
     maps = flat.astype(np.float32, copy=False)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies
 
 _HOMOGRAPHY, _REST = 8, 17  # number of its parameters, and position of the first one after the lens
 _TAU, _K3 = slice(14, 16), 16
@@ -282,14 +283,11 @@ class SmoothMap:
 
 
 def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
-    """Fit a homography to points (N, 2) by linear least squares; affine for fewer than 4 points."""
-    x, y, one = frame.ground(grid)
-    u, v = ((pixels - frame.centre) / frame.unit).T
-    zero = np.zeros_like(x)
-    upper = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=-1)
-    lower = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=-1)
+    """Fit a homography to points (N, 2) by linear least squares."""
+    ground, scaled = frame.ground(grid)[:2].T, (pixels - frame.centre) / frame.unit
+    matrix = homographies(ground[None], scaled[None])[0]
     values = np.zeros(_REST)
-    values[:8] = np.linalg.lstsq(np.concatenate([upper, lower]), np.concatenate([u, v]), rcond=None)[0]
+    values[:_HOMOGRAPHY] = (matrix / matrix[2, 2]).ravel()[:_HOMOGRAPHY]
     return SmoothMap(frame, values)
 
 

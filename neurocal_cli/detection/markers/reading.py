@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
-from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels
+from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
 from neurocal_cli.observations.markers import DICTIONARIES, code, code_count, correctable
 
 # Dictionaries that may be meant when none is named, those in use most first. The smaller ones of a size are
@@ -225,13 +225,9 @@ def _codes_of_negative(
 
 def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
     """Markers of each dictionary and border that has at least two within quadrangles (N, 4, 2)."""
-    if not len(corners):
-        return
     H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     framed = _is_framed(grey, H)
     H, corners = H[framed], corners[framed]
-    if not len(corners):
-        return
     for border in (1, 2):
         for bits in sorted(set(DICTIONARIES.values())):
             light, good = _cells(grey, H, bits, border)
@@ -250,10 +246,8 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
                     yield Marks(number, np.stack(placed)[first], dictionary), border
 
 
-def numbers_in(light: NDArray[np.float32], corners: Array, dictionary: str, border: int) -> NDArray[np.int64]:
+def numbers_in(light: Image, corners: Array, dictionary: str, border: int) -> NDArray[np.int64]:
     """Numbers (N,) of the markers of a dictionary within quadrangles (N, 4, 2), clockwise; -1 for none."""
-    if not len(corners):
-        return np.zeros(0, dtype=np.int64)
     H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     cells, good = _cells(light, H, DICTIONARIES[dictionary], border)
     return np.where(good, _matched(cells, dictionary)[0], -1)
@@ -267,13 +261,9 @@ def _is_framed(grey: NDArray[np.uint8], H: Array) -> NDArray[np.bool_]:
     return np.asarray((light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST))
 
 
-def _sampled(grey: NDArray[np.uint8] | NDArray[np.float32], H: Array, places: Array) -> Array:
+def _sampled(grey: NDArray[np.uint8] | Image, H: Array, places: Array) -> Array:
     """Grey levels (N, K) at places (K, 2) of each quadrangle."""
-    pixels = homography_at(H, np.broadcast_to(places, (len(H), *places.shape))).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        nowhere = np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)
-    sampled = cv2.remap(grey, nowhere, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
-    return np.asarray(sampled, dtype=float).reshape(len(H), len(places))
+    return interpolate(grey, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
 
 
 def _levels(grey: Array) -> tuple[Array, Array]:
@@ -284,7 +274,7 @@ def _levels(grey: Array) -> tuple[Array, Array]:
 
 
 def _cells(
-    grey: NDArray[np.uint8] | NDArray[np.float32], H: Array, bits: int, border: int
+    grey: NDArray[np.uint8] | Image, H: Array, bits: int, border: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Light cells (N, bits, bits) of codes, and (N,) whether the border is dark."""
     side = bits + 2 * border
