@@ -170,12 +170,12 @@ def _without_odd(
     Two settings of which each has the other's name hide each other: without one of them, the networks still
     follow the other one.
     """
-    rest, odd = start, list[tuple[Array, Tables, int]]()
+    rest, odd = start, list[tuple[CalibratedSettings, int]]()
     while len(odd) < _TOGETHER and start.may_reject(len(odd)):
         suspect = most_suspect(*left_out_errors(rest, joints[0]))
         if suspect is None:
             return None
-        odd.append((rest.lens.settings[suspect], rest.tables, suspect))
+        odd.append((rest, suspect))
         rest = rest.without(suspect)
         joints = _trained(rest, replace(options, budget=replace(options.budget, starts=6)))
         lens = provisional(rest, joints, options)
@@ -183,9 +183,9 @@ def _without_odd(
         if all(reasons):
             unit, left = other_unit(start) or "", set(rest.lens.points.view_names)
             out = tuple(name for name in start.lens.points.view_names if name not in left)
-            for (setting, *_), reason in zip(odd, reasons, strict=True):
+            for (held, s), reason in zip(odd, reasons, strict=True):
                 said = f"{reason}; {unit}" if unit.startswith(out) else str(reason)
-                rest = rest.with_rejected(setting, said)
+                rest = rest.with_rejected(held.lens.settings[s], said)
             return rest
     return None
 

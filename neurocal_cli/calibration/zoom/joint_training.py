@@ -47,7 +47,6 @@ from neurocal_cli.calibration.zoom.settings import (
     Constants,
     PixelData,
     QuadraticError,
-    Tables,
     describe,
     far_value,
     inverse,
@@ -343,8 +342,7 @@ def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Arr
     expected = np.asarray(spread_out + own)
     normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
-    counts = np.maximum(normal.S[:, 2, 2], 1.0)  # the derivative by u0 is 1, so this is the number of points
-    return np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(normalised, 0.0)
+    return np.sqrt(np.maximum(squares, 0.0) / start.data.counts), np.maximum(normalised, 0.0)
 
 
 def most_suspect(pixels: Array, normalised: Array) -> int | None:
@@ -353,21 +351,18 @@ def most_suspect(pixels: Array, normalised: Array) -> int | None:
     return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
 
 
-def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | None:
-    """Reason to reject setting s, given a lens that was fitted without it; None to keep it.
-
-    The tables were fitted with the setting, whose controls are `setting` (D,).
-    """
+def contradiction(lens: ZoomLens, start: CalibratedSettings, s: int) -> str | None:
+    """Reason to reject setting s of the start, given a lens that was fitted without it; None to keep it."""
     try:
-        prediction = lens.predict(setting[None])
+        prediction = lens.predict(start.lens.settings[s : s + 1])
     except InputError:  # no valid camera there, because another setting is wrong
         return None
     L = len(lens.names)
-    H = tables.normal.S[s, :L, :L]
-    error = prediction.local[0] - tables.local[s]
+    H = start.tables.normal.S[s, :L, :L]
+    error = prediction.local[0] - start.tables.local[s]
     own = lens.variance * np.linalg.pinv(H, hermitian=True)
     sigmas = float(np.sqrt(error @ np.linalg.solve(prediction.covariance[0, :L, :L] + own, error) / L))
-    pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.S[s, 2, 2], 1.0)))
+    pixels = float(np.sqrt(max(error @ H @ error, 0.0) / start.data.counts[s]))
     if sigmas < _SIGMAS or pixels < _LEAST_ERROR * lens.noise_floor_px:
         return None
     return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

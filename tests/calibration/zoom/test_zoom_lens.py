@@ -232,6 +232,9 @@ def test_a_lens_of_a_moving_board() -> None:
     )
     assert not lens.still
     assert lens.names == ("alpha_u", "alpha_v", "u0", "v0")
+    # A pose of each view's own takes up nearly all that a wrong focal length would do to its pixels.
+    assert lens.left_out_px < 1.5 * 0.1 * np.sqrt(2)
+    assert judge_lens(lens).word == "good"
     at = np.array([[300.0], [700.0]])
     prediction = lens.predict(at)
     true = 800 * np.exp(0.0009 * at[:, 0])
