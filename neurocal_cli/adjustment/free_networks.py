@@ -29,9 +29,9 @@ _SAME_PLANE = 1e-3
 def conditions_on_views(views: Views, state: CameraState) -> NDArray[np.intp]:
     """(V,) number of conditions that a common camera imposes on the network of each view.
 
-    Of the network's eleven parameters a flat target determines eight, or all if seen through a wide lens.
+    Of the network's eleven parameters a flat target determines eight, or all if the lens distorts it.
     """
-    flat = views.nearly_flat & (state.model not in WIDE)
+    flat = views.nearly_flat & (state.model not in WIDE) & (not state.k.any())
     return np.where(flat, 2, 5)
 
 

@@ -52,7 +52,7 @@ _BEHIND = 1.5  # times the squared error of a richer model, from which on a mode
 _PROMISING = 4.0
 _ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
-_SPARE = 1.3  # fewest equations per unknown
+_SPARE = 0.3  # fewest equations beyond the unknowns, per unknown of the camera and one pose
 _WIDE = 0.7  # least radius of the points for a fisheye model: 35 degrees from the axis
 _TOLD_APART = 4.0  # squared standard deviations per coefficient that differ significantly from 0
 # Chi-squared of p1 and p2 of a wide lens: photographs whose p1 is 2.5 std, counted by views, reach 35.
@@ -100,8 +100,9 @@ class Candidate:
 def supported(problem: Problem, model: str) -> Problem | None:
     """The problem with this model; None if there are too few points for it."""
     with_model = problem.with_model(model)
-    equations = problem.views.n_distinct_equations
-    if model != "none" and equations < _SPARE * with_model.n_parameters + 4:
+    unknowns = with_model.n_parameters
+    spare = problem.views.n_distinct_equations - unknowns
+    if model != "none" and spare < _SPARE * min(unknowns, with_model.free_camera.sum() + 6) + 4:
         return None
     return with_model
 
