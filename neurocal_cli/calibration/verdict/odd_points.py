@@ -118,7 +118,7 @@ def _outside(points: Correspondences) -> Iterator[Finding]:
         return
     size = np.array(points.image_size, dtype=float)
     count = int(_beyond(points.pixels, size).sum())
-    if count == 0:
+    if count == 0 or points.undistorted:  # which spreads them beyond the image
         return
     text = f"{count} points lie outside the image" if count > 1 else "1 point lies outside the image"
     if count <= _SOME * len(points):

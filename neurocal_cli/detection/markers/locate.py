@@ -209,8 +209,8 @@ def _reason(board: Board, grey: NDArray[np.uint8], read: int, quadrangles: Seque
                 "correct the dictionary of the board"
             )
     return (
-        "no two markers of the board can be read together; show more of it, sharp and evenly lit, or correct "
-        "its description"
+        "no two markers of the board can be read together, and one is not enough; show more of it, sharp and "
+        "evenly lit, or correct its description"
     )
 
 

@@ -65,6 +65,12 @@ def test_odd_pixels_are_named(pixels: np.ndarray, said: str) -> None:
     assert said in next(iter(odd_pixels(points)))[1]
 
 
+def test_undistorted_points_may_lie_outside_the_image() -> None:
+    points = replace(POINTS, pixels=1.5 * POINTS.pixels - [160, 120])
+    assert list(odd_pixels(points))
+    assert list(odd_pixels(replace(points, undistorted="plane"))) == []
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_an_axis_that_points_the_other_way_is_named(axis: int) -> None:
     pixels = POINTS.pixels * [-1 if k == axis else 1 for k in range(2)]
