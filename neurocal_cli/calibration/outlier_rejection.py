@@ -61,6 +61,7 @@ NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _MAJORITY = 0.5  # share of the points that must be left
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
 _FEW = 30.0  # spare equations below which points are left out only if the evidence favours it
+_FEW_EACH = 3.0  # the same for each unknown, as in views of four to twelve points (test_few_views.py)
 _FALLS = 0.5  # factor on the rms error without outliers that noise hid; without half of the noise it is 0.55
 _BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens cannot have produced
 
@@ -112,10 +113,11 @@ def fit_robustly(
         if contradicts or rms(first) > MISFIT * pixel_spread(problem.points):
             raise
         return first, Rejected()
-    if solution.spare_equations < _FEW:
-        better = _is_more_probable(kept, solution, first)
+    falls, spare = rms(solution) < _FALLS * rms(first), solution.spare_equations
+    if spare < max(_FEW, _FEW_EACH * problem.n_parameters):
+        better = (falls and spare >= _FEW) or _is_more_probable(kept, solution, first)
     else:
-        better = contradicts or rms(solution) < _FALLS * rms(first)
+        better = contradicts or falls
     if not better:
         return first, Rejected()
     return solution.noted(of_all=first), _rejected(problem.points, kept, solution)

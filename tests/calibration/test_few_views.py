@@ -1,4 +1,4 @@
-"""A board that is estimated from few views takes in their contradictions, and the std say so."""
+"""Few views, whose contradictions an estimated board takes in; and many views of few points each."""
 
 from __future__ import annotations
 
@@ -64,3 +64,20 @@ def test_hardly_a_result_of_few_views_is_far_beyond_its_std(n: int, change: Chan
     errors = np.array([over_std(change(views(n, seed), seed)) for seed in range(20)])
     assert np.count_nonzero(np.abs(errors).max(axis=1) > 5) <= 1
     assert np.sqrt(np.mean(errors**2)) < 2
+
+
+@pytest.mark.parametrize("kept", [(0, 8, 54, 62), (0, 8, 31, 54, 62)])
+def test_views_of_few_points_show_the_lens_and_agree(kept: tuple[int, ...]) -> None:
+    """As of a single marker. With a lens that distorts, a camera of its own fits five points exactly."""
+    rng = np.random.default_rng([len(kept), 5])
+    K = np.array([[1000.0, 0.0, CENTRE[0]], [0.0, 1000.0, CENTRE[1]], [0.0, 0.0, 1.0]])
+    whole, *_ = views_of(K, np.array([-0.2, 0.08]), "k1k2", lambda: np.zeros((63, 3)), 30, 0.1, rng)
+    found = calibrate(whole.select(np.isin(np.arange(len(whole)) % 63, kept)))
+    std = np.array([found.std[name] for name in ("alpha_u", "alpha_v", "u0", "v0")])
+    A = found.intrinsics
+    assert found.distortion_model != "none"
+    assert np.abs((np.array([A.alpha_u, A.alpha_v, A.u0, A.v0]) - TRUE) / std).max() < 4
+    assert std.max() < 3
+    assert not found.n_rejected  # points that weigh little have larger residuals than the others
+    assert found.verdict is not None
+    assert found.verdict.word == "good", found.verdict.reasons
