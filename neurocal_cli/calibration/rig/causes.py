@@ -358,14 +358,12 @@ def _named(
 def _frames_of(problem: RigProblem, subject: int) -> tuple[NDArray[np.intp], list[str]]:
     """The frames of the rig that a camera, or any, saw, in the order of their names, and words for them."""
     of_two = len(problem.names) == 2  # of two cameras a frame is the pair of their views
-    views: dict[int, list[str]] = {}
-    for side in range(len(problem.names)) if subject < 0 or of_two else (subject,):
-        for name, frame in zip(problem.names[side], problem.observations[side].view.tolist(), strict=True):
-            if problem.together[frame]:
-                views.setdefault(frame, []).append(name)
-    frames = np.array(list(views), dtype=np.intp)
-    order = in_sequence(tuple(names[0] for names in views.values()))
-    return frames[order], ["/".join(views[k][: 1 + of_two]) for k in frames[order].tolist()]
+    anyone = subject < 0 or of_two
+    views = {k: own for k, own in enumerate(problem.views) if len(own) > 1 and (anyone or subject in own)}
+    names = {k: list(own.values())[: 1 + of_two] if anyone else [own[subject]] for k, own in views.items()}
+    order = in_sequence(tuple(own[0] for own in names.values()))
+    frames = np.array(list(names), dtype=np.intp)[order]
+    return frames, ["/".join(names[k]) for k in frames.tolist()]
 
 
 @frozen_dataclass(eq=False)

@@ -253,11 +253,8 @@ def exchanged_cameras(edges: Sequence[Edge], problem: RigProblem, names: Sequenc
     suspects = sorted(most[odd[most] >= LEAST_AGREED].tolist())
     if len(suspects) < 2:
         return ""
-    word: dict[int, str] = {}
-    for own, seen in zip(problem.names, problem.observations, strict=True):
-        for name, frame in zip(own, seen.view.tolist(), strict=True):
-            word.setdefault(frame, name)
-    order = in_sequence(tuple(word[k] for k in range(len(word))))
+    word = [next(iter(views.values())) for views in problem.views]
+    order = in_sequence(tuple(word))
     place = np.argsort(order)
     for a, b in combinations(suspects, 2):
         if (found := exchanged(problem, a, b, place)) is not None:

@@ -192,9 +192,5 @@ def _assembled(fit: RigFit, names: list[str], covariance: Covariance) -> Rig:
 
 def _frames(problem: RigProblem, names: list[str]) -> dict[str, dict[str, str]]:
     """The views of each frame that several cameras saw, by the name that the first of them gave it."""
-    frames: dict[int, dict[str, str]] = {}
-    for camera, own, observed in zip(names, problem.names, problem.observations, strict=True):
-        for view, frame in zip(own, observed.view.tolist(), strict=True):
-            if problem.together[frame]:
-                frames.setdefault(frame, {})[camera] = view
-    return {next(iter(views.values())): views for views in frames.values()}
+    several = [{names[k]: view for k, view in views.items()} for views in problem.views if len(views) > 1]
+    return {next(iter(views.values())): views for views in several}

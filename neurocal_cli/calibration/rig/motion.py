@@ -76,13 +76,11 @@ def _clock(problem: RigProblem, times: Sequence[Array] | None) -> tuple[Array | 
 def _in_sequence(problem: RigProblem) -> Array | None:
     """Times of the frames by the last numbers in their names; None if some have none."""
     places = np.full(len(problem.scale), np.nan)
-    for names, observed in zip(problem.names, problem.observations, strict=True):
-        for name, frame in zip(names, observed.view.tolist(), strict=True):
-            if problem.together[frame] and np.isnan(places[frame]):
-                digits = re.findall(r"[0-9]+", name)
-                if not digits:
-                    return None
-                places[frame] = float(digits[-1][-12:])
+    for frame in np.flatnonzero(problem.together).tolist():
+        digits = re.findall(r"[0-9]+", next(iter(problem.views[frame].values())))
+        if not digits:
+            return None
+        places[frame] = float(digits[-1][-12:])
     known = np.sort(places[np.isfinite(places)])
     if len(known) < 2 or (np.diff(known) == 0).any():
         return None

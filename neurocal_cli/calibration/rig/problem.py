@@ -178,6 +178,15 @@ class RigProblem:
         return tuple(observed.views.names for observed in self.observations)
 
     @cached_property
+    def views(self) -> list[dict[int, str]]:
+        """Of each frame, the name of the view of each camera that saw it, by the index of the camera."""
+        found: list[dict[int, str]] = [{} for _ in self.scale]
+        for side, (names, observed) in enumerate(zip(self.names, self.observations, strict=True)):
+            for name, frame in zip(names, observed.view.tolist(), strict=True):
+                found[frame][side] = name
+        return found
+
+    @cached_property
     def n_views(self) -> NDArray[np.intp]:
         """(V,) of each frame."""
         views = np.concatenate([observed.view for observed in self.observations])
@@ -246,25 +255,24 @@ class RigProblem:
     def of_two(self, first: int, second: int) -> RigProblem:
         """The problem of two of the cameras."""
         sides = first, second
-        seen = [self.observations[side] for side in sides]
-        kept = np.zeros(len(self.scale), dtype=bool)
-        for observed in seen:
-            kept[observed.view] = True
-        place = np.cumsum(kept) - 1
         return replace(
-            self.of_frames(np.flatnonzero(kept)),
+            self._of_frames(np.arange(len(self.scale)), [self.observations[side] for side in sides]),
             calibrations=tuple(self.calibrations[side] for side in sides),
-            observations=tuple(replace(observed, view=place[observed.view]) for observed in seen),
             cameras=tuple(self.cameras[side] for side in sides),
             own_normal=tuple(self.own_normal[side] for side in sides),
             motion=None,
             penalties={},
         )
 
-    def of_frames(self, frames: NDArray[np.intp]) -> RigProblem:
-        """With other frames, by their index (V,) among the present ones; the views keep theirs."""
+    def _of_frames(self, frames: NDArray[np.intp], seen: Sequence[Observations]) -> RigProblem:
+        """With other frames, by their index among the present ones, as far as these observations show any."""
+        kept = np.zeros(len(frames), dtype=bool)
+        for observed in seen:
+            kept[observed.view] = True
+        place, frames = np.cumsum(kept) - 1, frames[kept]
         return replace(
             self,
+            observations=tuple(replace(observed, view=place[observed.view]) for observed in seen),
             centre=self.centre[frames],
             scale=self.scale[frames],
             basis=self.basis[frames],
@@ -281,12 +289,7 @@ class RigProblem:
             frames = np.concatenate([frames, view[apart]])
             view[apart] = np.arange(len(frames) - int(apart.sum()), len(frames))
             observations.append(replace(observed, view=view))
-        kept = np.zeros(len(frames), dtype=bool)
-        for observed in observations:
-            kept[observed.view] = True
-        place = np.cumsum(kept) - 1
-        seen = tuple(replace(observed, view=place[observed.view]) for observed in observations)
-        return replace(self.of_frames(frames[kept]), observations=seen)
+        return self._of_frames(frames, observations)
 
     def start(self, others: Sequence[Pose]) -> RigState:
         """The calibrated cameras, and the poses of the first camera that saw each frame.
