@@ -16,16 +16,14 @@ from neurocal_cli.calibration.verdict.assessment import (
 )
 from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.given_values import real_rows
 from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, ProjectedPoints, Spread
 from neurocal_cli.errors import InputError
 
 
 def project(calibration: Calibration, points: Array, view: str | None = None) -> ProjectedPoints:
     """Project points (N, 3); see `Calibration.project`."""
-    points = real_array("points", points)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points must have the shape (N, 3), found {points.shape}")
+    points = real_rows("points", points, 3)
     if view is not None:
         points = calibration.pose_of(view).to_camera(points)
     pixels, seen = calibration.camera.project(points)
@@ -43,9 +41,7 @@ _ON_PLANE = 1e-3  # largest |Z| of a point of the plane, as a share of the targe
 
 def on_plane(calibration: Calibration, pixels: Array, view: str, sigma: float | None) -> PlanePoints:
     """Points of a view's plane Z = 0; see `Calibration.on_plane`."""
-    pixels = real_array("pixels", pixels)
-    if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
+    pixels = real_rows("pixels", pixels, 2)
     pose, camera = calibration.pose_of(view), calibration.camera
     _check_flat(calibration, view)
     sigma = calibration.sigma if sigma is None else sigma

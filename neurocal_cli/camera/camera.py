@@ -17,7 +17,7 @@ from neurocal_cli.camera import projection
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.given_values import checked_size, real_array
+from neurocal_cli.camera.given_values import checked_size, real_rows
 from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, UsageError
@@ -250,10 +250,7 @@ class Camera:
 
 def _coordinates(name: str, values: Array, count: int) -> Array:
     """Coordinates, (count, ...), of points or pixels (..., count)."""
-    array = real_array(name, values)
-    if array.shape[-1:] != (count,):
-        raise InputError(f"{name} must have the shape (..., {count}), found {array.shape}")
-    return np.moveaxis(array, -1, 0)
+    return np.moveaxis(real_rows(name, values, count, stacked=True), -1, 0)
 
 
 class Calibrated(Protocol):

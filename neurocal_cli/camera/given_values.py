@@ -29,6 +29,15 @@ def real_array(name: str, values: ArrayLike) -> Array:
     return array
 
 
+def real_rows(name: str, values: ArrayLike, columns: int, stacked: bool = False) -> Array:
+    """The same for rows (N, columns), or for a stack of them (..., columns); another shape is an error."""
+    array = real_array(name, values)
+    if array.shape[-1:] != (columns,) or not (stacked or array.ndim == 2):
+        shape = f"({'...' if stacked else 'N'}, {columns})"
+        raise InputError(f"{name} must have the shape {shape}, found {array.shape}")
+    return array
+
+
 def checked_size(size: ArrayLike) -> tuple[int, int]:
     """Width and height of an image [px]; an InputError unless they are whole numbers from 1 to a million."""
     sides = real_array("image_size", size)

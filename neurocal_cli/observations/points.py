@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import UNDISTORTED, Array
-from neurocal_cli.camera.given_values import checked_size, real_array
+from neurocal_cli.camera.given_values import checked_size, real_array, real_rows
 from neurocal_cli.errors import InputError, check_kind
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.labels import factorise, first_repeat
@@ -373,12 +373,10 @@ class Correspondences:
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
-    array = real_array(name, values)
+    array = real_rows(name, values, columns)
     # Copy the array, unless nobody else can write to it: it may have a million rows.
     if not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None:
         array = array.copy()
-    if array.ndim != 2 or array.shape[1] != columns:
-        raise InputError(f"{name} must have the shape (N, {columns}), found {array.shape}")
     return array
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array, Shape
-from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.given_values import real_rows
 from neurocal_cli.camera.undistortion import (
     Undistorted,
     chosen_view,
@@ -75,9 +75,7 @@ def undistort_points(
     """
     camera = camera_of(camera)
     if not isinstance(points, Correspondences):
-        pixels = real_array("points", points)
-        if pixels.shape[-1:] != (2,):
-            raise InputError(f"pixels must have the shape (..., 2), found {pixels.shape}")
+        pixels = real_rows("pixels", points, 2, stacked=True)
         if not pixels.size:
             return pixels
         flat = pixels.reshape(-1, 2)

@@ -30,7 +30,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
-from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.given_values import real_rows
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, check_choice
 
@@ -136,7 +136,7 @@ def triangulate(
         left, right, pose, left_pixels, right_pixels = left.left, left.right, left.pose, right, pose
     elif left_pixels is None or right_pixels is None:
         raise InputError("pixels are missing; give a StereoRig and pixels, or two cameras, a Pose and pixels")
-    pixels = _pixels(left_pixels), _pixels(right_pixels)
+    pixels = real_rows("pixels", left_pixels, 2), real_rows("pixels", right_pixels, 2)
     n = len(pixels[0])
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
@@ -214,13 +214,6 @@ def _linear(seen: Sightings, wide: bool) -> Array:
     points = last[:, :3] / last[:, 3:]
     points[nowhere] = np.nan
     return np.asarray(points)
-
-
-def _pixels(values: Array) -> Array:
-    pixels = real_array("pixels", values)
-    if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
-    return pixels
 
 
 def _sees_sideways(camera: Camera, pixels: Array) -> bool:
