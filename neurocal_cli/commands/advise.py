@@ -6,7 +6,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
-from neurocal_cli.commands.streams import ProgressBar, answer, suggest
+from neurocal_cli.commands.streams import ProgressBar, suggest
 
 
 @click.command(cls=options.Command)
@@ -53,17 +53,13 @@ def advise(calibration: str, count: int, plots: Plots, as_json: bool) -> None:
         rig = rig_from_field(root)
         with ProgressBar("comparing views"):
             ties = advise_rig(rig, count)
-        answer(as_json, lambda: show.rig_advice_json(ties), lambda: "\n".join(show.rig_advice_lines(ties)))
+        show.rig_advice_report(ties).print(as_json)
         write_plots(plots, show.draw_rig_advice, ties, rig)
         return
     known = calibration_from_field(root)
     with ProgressBar("comparing views"):
         advice = weigh(known, count)
-    answer(
-        as_json,
-        lambda: show.advice_json(advice),
-        lambda: "\n".join(show.advice_lines(advice, known.verdict)),
-    )
+    show.advice_report(advice, known.verdict).print(as_json)
     write_plots(plots, show.draw_advice, advice, known)
     if plots:
         suggest(calibration, "photograph these views, and calibrate from all images")

@@ -33,15 +33,12 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
     "A CSV file with a row for each data set, or a folder: each of its leaf folders with images, or points, "
     "is a data set.",
 )
-@click.option(
+@options.pairs(
     "--set",
-    "common",
-    metavar="COLUMN=VALUE",
-    multiple=True,
-    callback=options.pairs,
-    show_default="none",
-    help="A column of the manifest for all data sets that do not have it, such as board=board.yaml or "
+    "COLUMN=VALUE",
+    "A column of the manifest for all data sets that do not have it, such as board=board.yaml or "
     "distortion=k1k2. It can be repeated.",
+    to="common",
 )
 @options.path(
     "--against",
@@ -64,13 +61,7 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
 )
 @options.flag("--force", "Do all jobs again, also those that are done.")
 @options.json
-@options.path(
-    "-o",
-    "DIR",
-    "Folder for the results: DIR/NAME for each data set, and the summary.",
-    to="output",
-    required=True,
-)
+@options.output("DIR", "Folder for the results: DIR/NAME for each data set, and the summary.", required=True)
 def batch(
     manifest: str,
     common: options.Named,

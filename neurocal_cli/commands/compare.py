@@ -8,7 +8,7 @@ from dataclasses import replace
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import ProgressBar, answer, note, suggest
+from neurocal_cli.commands.streams import ProgressBar, note, suggest
 
 
 @click.command(cls=options.Command)
@@ -87,12 +87,12 @@ def compare(
     if image_size is not None:
         given = [replace(one, image_size=image_size) for one in given]
 
-    from neurocal_cli.commands.show.methods_report import comparison_json, comparison_report
+    from neurocal_cli.commands.show.methods_report import comparison_report
     from neurocal_cli.simulation.comparison import compare as compare_methods
 
     with ProgressBar() as progress:
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
     note(*found.notes)
-    answer(as_json, lambda: comparison_json(found), lambda: comparison_report(found))
+    comparison_report(found).print(as_json)
     step = "calibrate {} -o camera.yaml" if right is None else f"stereo {{}} {shlex.quote(right)} -o rig.yaml"
     suggest(points, f"neurocal {step}")

@@ -169,11 +169,9 @@ def convert(
           -o corners.npz
       neurocal convert corners.npz --what points --to json -o corners.json
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(*files, board.file)
-    preparation.check_summary(as_json, output)
     board.check_unit()
     folder = os.path.isdir(output) or output.endswith(os.sep)
-    preparation.check_outputs(() if folder else (output,), (*files, board.file))
+    preparation.check((*files, board.file), () if folder else (output,), as_json=as_json)
     described = board.file is not None or board.square is not None
     target_board = (board if described else replace(board, unit=None)).read()
     from neurocal_cli.files.exchange.format_table import CameraSet

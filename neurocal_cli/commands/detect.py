@@ -295,11 +295,7 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
     found = detections(outcomes)
     problems = {name: outcome.problem for name, outcome in outcomes.items() if outcome.problem}
     complain_of(outcomes.values(), board)
-    remarks: dict[str, list[str]] = {}
-    for name, outcome in outcomes.items():
-        for text in outcome.notes:
-            remarks.setdefault(text, []).append(name)
-    note_once(remarks)
+    note_once((name, text) for name, outcome in outcomes.items() for text in outcome.notes)
     warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
     turns = Counter(outcome.turned or "as stored" for outcome in outcomes.values())
     if len(turns) > 1:  # each way of turning has its own image centre

@@ -8,7 +8,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
-from neurocal_cli.commands.streams import answer, note
+from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import FormatError, InputError
 
 if TYPE_CHECKING:
@@ -60,18 +60,13 @@ def drift(old: str, new: str, plots: Plots, as_json: bool) -> None:
     from neurocal_cli.calibration.rig.rig_drift import find_rig_drift
     from neurocal_cli.camera.camera import camera_of
     from neurocal_cli.commands.show import drift_report as show
-    from neurocal_cli.commands.show.text import tabulated
 
     before, after = _read(old), _read(new)
     if isinstance(before, Rig) and isinstance(after, Rig):
         rigs = find_rig_drift(before, after)
         found, limit, different = rigs.cameras, rigs.limit, rigs.different
         sizes = {name: before.cameras[name].image_size or after.cameras[name].image_size for name in found}
-        answer(
-            as_json,
-            lambda: show.rig_drift_json(rigs),
-            lambda: tabulated(show.rig_drift_tables(rigs), show.rig_drift_lines(rigs)),
-        )
+        show.rig_drift_report(rigs).print(as_json)
     elif isinstance(before, Rig) or isinstance(after, Rig):
         raise InputError("one file is a rig and the other one camera; give two of a kind")
     else:
@@ -83,11 +78,7 @@ def drift(old: str, new: str, plots: Plots, as_json: bool) -> None:
                 f"the distortion models differ ({models[0]} and {models[1]}), which may be all that changed; "
                 "calibrate both with the same --distortion"
             )
-        answer(
-            as_json,
-            lambda: show.drift_json(one) | show.details_json(before, after, one),
-            lambda: tabulated(show.drift_tables(before, after, one), show.drift_lines(one)),
-        )
+        show.drift_report(before, after, one).print(as_json)
     write_plots(plots, show.draw_drift, {name: (found[name], sizes[name]) for name in found}, limit)
     if different:
         click.get_current_context().exit(_DIFFERENT)

@@ -13,7 +13,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
-from neurocal_cli.commands.streams import answer, first_of, note, noted, suggest, warn
+from neurocal_cli.commands.streams import first_of, note, noted, suggest, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class _Group(options.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the command, that of a file by what it holds."""
-        if args and args[0] not in self.commands and os.path.isfile(args[0]):
+        if args and args[0] not in self.commands and os.path.exists(args[0]):
             from neurocal_cli.files.camera_tree import own_kind, read_tree
 
             kind = own_kind(read_tree(args[0])) or "camera"
@@ -164,8 +164,8 @@ def camera(
     from neurocal_cli.calibration.evaluation import evaluate_camera, judged_by_points
     from neurocal_cli.calibration.verdict.assessment import assess
     from neurocal_cli.commands.show import camera_report as show
-    from neurocal_cli.commands.show.drift_report import drift_json, since_line
-    from neurocal_cli.commands.show.text import tabulated, verdict_lines
+    from neurocal_cli.commands.show.drift_report import since_report
+    from neurocal_cli.commands.show.text import Report
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
     own = judged if isinstance(judged, Calibration) else None
@@ -178,10 +178,10 @@ def camera(
     places = {name: own.position(name) for name in own.views} if own is not None and positions else {}
     evaluation = evaluate_camera(judged, seen)
     verdict = None if own is None else assess(own)
-    drift, since = None, list[str]()
+    drift, since = None, Report()
     if own is not None and given is not None and evaluation.fit is not None:
         drift = drift_since(own, evaluation.fit.points)
-        since = [since_line(drift)]
+        since = since_report(drift)
     if own is not None and given is not None and verdict is not None:
         verdict = judged_by_points(verdict, own, evaluation, drift)
     renamed = evaluation.renamed
@@ -194,15 +194,11 @@ def camera(
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
-    changed = {} if drift is None else {"drift": drift_json(drift)}
-    where = {"positions": show.positions_json(places)} if positions else {}
     unit = "" if own is None else own.unit
-    tables = *show.plane_tables(on_plane, unit), *show.position_tables(places, unit)
-    answer(
-        as_json,
-        lambda: show.evaluation_json(evaluation, verdict) | changed | show.plane_json(on_plane) | where,
-        lambda: tabulated((*show.evaluation_tables(evaluation), *tables), [*since, *verdict_lines(verdict)]),
-    )
+    told = show.evaluation_report(evaluation, verdict, since) | show.plane_report(on_plane, unit)
+    if positions:
+        told |= show.position_report(places, unit)
+    told.print(as_json)
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
@@ -296,8 +292,7 @@ def stereo(
         raise UsageError("--at needs a rig; give one that neurocal stereo wrote")
     space = _errors_at(at, rig)
     from neurocal_cli.commands.show import rig_report as show
-    from neurocal_cli.commands.show.camera_report import plane_json, plane_tables
-    from neurocal_cli.commands.show.text import tabulated, verdict_lines
+    from neurocal_cli.commands.show.camera_report import plane_report
 
     note(*show.views_alone(evaluation.alone))
     if evaluation.fitted:
@@ -306,12 +301,7 @@ def stereo(
             "the cameras fixed"
         )
     warn(*evaluation.warnings)
-    tables = *show.stereo_evaluation_tables(evaluation), *plane_tables(space, evaluation.unit)
-    answer(
-        as_json,
-        lambda: show.stereo_evaluation_json(evaluation) | plane_json(space),
-        lambda: tabulated(tables, verdict_lines(evaluation.verdict)),
-    )
+    (show.stereo_evaluation_report(evaluation) | plane_report(space, evaluation.unit)).print(as_json)
     if plots:
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
@@ -359,9 +349,8 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     named = [named_file(word) for word in points]
     preparation.check((file, *(name for _, name in named)))
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
-    from neurocal_cli.commands.show.camera_report import plane_json, plane_tables
-    from neurocal_cli.commands.show.rig_report import rig_evaluation_json, rig_evaluation_tables
-    from neurocal_cli.commands.show.text import tabulated, verdict_lines
+    from neurocal_cli.commands.show.camera_report import plane_report
+    from neurocal_cli.commands.show.rig_report import rig_evaluation_report
     from neurocal_cli.files.rig_points import read_rig_points
     from neurocal_cli.files.rig_yaml import read_rig
 
@@ -370,12 +359,7 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     evaluation, space = evaluate_rig(found, given), _errors_at(at, found)
     if evaluation.n_behind:
         warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")
-    tables = *rig_evaluation_tables(evaluation), *plane_tables(space, evaluation.unit)
-    answer(
-        as_json,
-        lambda: rig_evaluation_json(evaluation) | plane_json(space),
-        lambda: tabulated(tables, verdict_lines(evaluation.verdict)),
-    )
+    (rig_evaluation_report(evaluation) | plane_report(space, evaluation.unit)).print(as_json)
     if not as_json:
         suggest(file, "neurocal report {} -o report.html")
 

@@ -10,10 +10,10 @@ from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, plot_result, write_plots
 from neurocal_cli.commands.streams import (
     ProgressBar,
-    answer,
     concluding,
     noted,
     print_summary,
+    print_text,
     say,
     suggest,
     warn,
@@ -255,18 +255,17 @@ def evaluate(lens_file: str, points: str | None, plots: Plots, as_json: bool) ->
 
     learnt = read_lens(lens_file)
     if points is None:  # as `fit` shows it
-        answer(as_json, lambda: show.lens_json(learnt), lambda: show.lens_report(learnt))
+        if as_json:
+            print_summary(show.lens_json(learnt))
+        else:
+            print_text(lambda: show.lens_report(learnt))
         warn(*learnt.warnings)
         suggest(lens_file, "neurocal lens evaluate {} POINTS.csv", "neurocal report {} -o report.html")
         return
     data = noted(read_lens_points, points)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
-    answer(
-        as_json,
-        lambda: show.evaluation_json(evaluation, verdict),
-        lambda: show.evaluation_report(evaluation, learnt.controls, verdict),
-    )
+    show.evaluation_report(evaluation, learnt.controls, verdict).print(as_json)
     warn(*evaluation.warnings)
     write_plots(plots, show.draw_evaluation, evaluation, learnt.controls)
     suggest(lens_file, "neurocal report {} -o report.html")

@@ -436,15 +436,19 @@ seed = count(
 )
 
 
-def pairs(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Named:
-    """Values of an option NAME=VALUE that can be repeated."""
-    found = []
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise click.BadParameter(f"{word!r} is not {param.metavar}.")
-        found.append((name, value))
-    return tuple(found)
+def pairs(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
+    """An option NAME=VALUE that can be repeated; a command gets it as `Named`."""
+
+    def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Named:
+        found = []
+        for word in words:
+            own, equals, value = word.partition("=")
+            if not (own and equals and value):
+                raise click.BadParameter(f"{word!r} is not {metavar}.")
+            found.append((own, value))
+        return tuple(found)
+
+    return _option(name, help, without, metavar=metavar, multiple=True, callback=parse, **more)
 
 
 no_skew = flag(
@@ -466,13 +470,10 @@ square_pixels = flag(
     without="estimate both",
 )
 
-fix = click.option(
+fix = pairs(
     "--fix",
-    metavar="NAME=VALUE",
-    multiple=True,
-    callback=pairs,
-    show_default="none",
-    help="A parameter that is known and stays as it is: alpha_u, alpha_v, u0, v0 [px], theta=90 [degrees], "
+    "NAME=VALUE",
+    "A parameter that is known and stays as it is: alpha_u, alpha_v, u0, v0 [px], theta=90 [degrees], "
     "or a coefficient of the model that --distortion names, such as k3=0. It can be repeated.",
 )
 

@@ -46,24 +46,19 @@ class _Command(options.Command):
     nargs=-1,
     required=True,
 )
-@click.option(
+@options.pairs(
     "--intrinsics",
-    "known",
-    metavar="NAME=CAMERA.yaml",
-    multiple=True,
-    callback=options.pairs,
-    show_default="none",
-    help="A camera that is known: a neurocal, ROS or OpenCV file. Only its poses are estimated. It can be "
+    "NAME=CAMERA.yaml",
+    "A camera that is known: a neurocal, ROS or OpenCV file. Only its poses are estimated. It can be "
     "repeated.",
+    to="known",
 )
-@click.option(
+@options.pairs(
     "--distortion-of",
-    "models",
-    metavar="NAME=MODEL",
-    multiple=True,
-    callback=options.pairs,
-    show_default="as --distortion",
-    help="The distortion model of one camera, also written --distortion NAME=MODEL. It can be repeated.",
+    "NAME=MODEL",
+    "The distortion model of one camera, also written --distortion NAME=MODEL. It can be repeated.",
+    without="as --distortion",
+    to="models",
 )
 @boards.board_of_corners
 @estimation_options(files=False)

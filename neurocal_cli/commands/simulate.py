@@ -11,7 +11,7 @@ import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
-from neurocal_cli.commands.streams import ProgressBar, answer, note
+from neurocal_cli.commands.streams import ProgressBar, note
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
 from neurocal_cli.files.writing import make_folder, write_whole
 
@@ -198,10 +198,10 @@ def simulate(
 
         with ProgressBar() as progress:
             found = study_rates(data_sets, seed, jobs, progress)
-        answer(as_json, lambda: show.rates_json(found), lambda: show.text_of(*show.rates_tables(found)))
+        show.rates_report(found).print(as_json)
         write_plots(plots, show.draw_rates, found)
         return
-    scene, paper = _scene(camera, board, views, seed)
+    scene, paper = _scene(camera, board, views, seed), (camera, board, views) == (None,) * 3
     levels = sorted(set(sigma))
     if save is not None:
         _save(scene, save, levels, seed, images)
@@ -210,24 +210,18 @@ def simulate(
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
         starts = _starts(scene, random_starts, seed, jobs, progress)
-    answer(
-        as_json,
-        lambda: show.simulation_json(scene, seed, study, starts),
-        lambda: show.text_of(*show.simulation_tables(study, starts, paper)),
-    )
+    show.simulation_report(scene, seed, study, starts, paper).print(as_json)
     write_plots(plots, show.draw_simulation, study, starts, scene.unit)
 
 
-def _scene(
-    camera_file: str | None, board_file: str | None, views: int | None, seed: int
-) -> tuple[SimulatedScene, bool]:
-    """The scene, and whether it is that of the paper."""
+def _scene(camera_file: str | None, board_file: str | None, views: int | None, seed: int) -> SimulatedScene:
+    """The scene; without options, that of the paper."""
     import numpy as np
 
     from neurocal_cli.simulation import scenes
 
     if camera_file is None and board_file is None and views is None:
-        return scenes.paper_scene(), True
+        return scenes.paper_scene()
     camera, board = scenes.PAPER_CAMERA, scenes.PAPER_BOARD
     if board_file is not None:
         board = boards.named_board(board_file)
@@ -238,13 +232,13 @@ def _scene(
         own = board_file is None and views is None and camera_file != "-"
         if own:
             with suppress(FormatError):
-                return scenes.calibrated_scene(read_calibration(camera_file)), False
+                return scenes.calibrated_scene(read_calibration(camera_file))
         camera = camera_of(preparation.known_camera(camera_file))
         if own:
             note(f"{camera_file} holds no points of its own; the paper's boards are used")
     count = views or (_FLAT_VIEWS if len(board.planes) == 1 else 1)
     poses = scenes.random_poses(camera, board, count, np.random.default_rng((seed, 2)))
-    return scenes.scene_of(camera, board, poses), False
+    return scenes.scene_of(camera, board, poses)
 
 
 def _starts(
@@ -277,24 +271,23 @@ def _rig(
         raise UsageError(f"--rig {words}: give the layout and the number of cameras, such as ring:8")
     import numpy as np
 
-    from neurocal_cli.commands.show.methods_report import rig_study_json, rig_study_table, text_of
+    from neurocal_cli.commands.show.methods_report import rig_study_report
     from neurocal_cli.simulation.rigs import study_rig
 
     with ProgressBar() as progress:
         study = study_rig(layout, int(count), views or _RIG_FRAMES, levels, trials, seed, progress)
+    report = rig_study_report(study)
     if save is not None:
         from neurocal_cli.files.points_csv import write_points
 
         make_folder(save)
-        poses = rig_study_json(study)["poses"]
-        write_whole(
-            os.path.join(save, "truth.json"), json.dumps({"unit": "mm", "poses": poses}, indent=2) + "\n"
-        )
+        truth = {"unit": "mm", "poses": report.tree["poses"]}
+        write_whole(os.path.join(save, "truth.json"), json.dumps(truth, indent=2) + "\n")
         for k, level in enumerate(levels):
             for name, points in study.rig.points(level, np.random.default_rng((seed, k, 0))).items():
                 file = f"sigma_{str(level).removesuffix('.0')}_{name}.csv"
                 write_points(points, os.path.join(save, file))
-    answer(as_json, lambda: rig_study_json(study), lambda: text_of(*rig_study_table(study)))
+    report.print(as_json)
 
 
 def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, images: bool) -> None:

@@ -273,9 +273,12 @@ def warned(read: Callable[..., T], *given: Any, **how: Any) -> T:
     return found
 
 
-def note_once(remarks: Mapping[str, Sequence[str]]) -> None:
-    """Report remarks, each with the first name of those that it is about, and their number."""
-    for text, names in remarks.items():
+def note_once(remarks: Iterable[tuple[str, str]]) -> None:
+    """Report remarks (name, text), each text once with the first of its names, and their number."""
+    found: dict[str, list[str]] = {}
+    for name, text in remarks:
+        found.setdefault(text, []).append(name)
+    for text, names in found.items():
         note(f"{names[0]}: {text}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {text}")
 
 
@@ -321,14 +324,6 @@ def print_text(made: Callable[[], str]) -> None:
     click.echo(text)
 
 
-def answer(as_json: bool, in_json: Callable[[], dict[str, Any]], in_words: Callable[[], str]) -> None:
-    """Print a result on stdout: as JSON, or as text for its width if it is a terminal."""
-    if as_json:
-        print_summary(in_json())
-    else:
-        print_text(in_words)
-
-
 def summarise(as_json: bool, tree: dict[str, Any], *lines: str) -> None:
     """Tell what was written: as JSON on stdout, or in words."""
     if as_json:
@@ -368,7 +363,7 @@ def first_of(names: Sequence[str]) -> str:
     return ", ".join([*names[:5], *(["..."] if len(names) > 5 else [])])
 
 
-def print_summary(tree: dict[str, Any]) -> None:
+def print_summary(tree: Mapping[str, Any]) -> None:
     """Print the summary of a result as JSON on stdout; see `for_json`."""
     end_waiting()
     click.echo(json.dumps(for_json(tree), indent=2, allow_nan=False))

@@ -225,7 +225,7 @@ class _Undistorting:
     view: Callable[[tuple[int, int] | None], Undistorted]  # of the results, from the size of the images
     interpolation: str
     size: tuple[int, int] | None  # of the images [px], once it is known
-    notes: dict[str, list[str]] = field(default_factory=dict)  # remarks about images, and the images
+    notes: list[tuple[str, str]] = field(default_factory=list)  # images, and remarks about them
     left_out: int = 0  # number of points that the result cannot show
 
     def new(self) -> Undistorted:
@@ -245,12 +245,9 @@ class _Undistorting:
 
     def correct_all(self, paths: Sequence[str], outputs: Sequence[str]) -> dict[str, str]:
         """Undistort all files; return those that failed, with the reasons. A single file raises."""
-        if len(paths) > 1:
-            failed = each_of(list(zip(paths, outputs, strict=True)), self._correct, "files", "undistorted")
-            return {paths[k]: reason for k, reason in failed.items()}
-        for place in zip(paths, outputs, strict=True):
-            self._correct(place)
-        return {}
+        places = list(zip(paths, outputs, strict=True))
+        failed = each_of(places, self._correct, "files", "undistorted") if places else {}
+        return {paths[k]: reason for k, reason in failed.items()}
 
     def tell_loss(self) -> None:
         """Report the part of a wide lens's field of view that the results lose."""
@@ -328,8 +325,7 @@ class _Undistorting:
         with value_failures(source):
             corrected = remapping(pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
-        for text in notes:
-            self.notes.setdefault(text, []).append(path)
+        self.notes += [(path, text) for text in notes]
         return content
 
     def _points(self, path: str) -> str:

@@ -28,7 +28,7 @@ from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, Levenber
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.network.network import Patterns, Task, Trained
+from neurocal_cli.network.network import Patterns, Task, Trained, optimal_gamma
 
 
 @frozen_dataclass
@@ -65,10 +65,13 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
         patterns, product, free = replace(task.patterns, inputs=hidden), task.W, task.free_W
     else:
         raise InputError("the hidden weights must be either all free or all given")
-    networks = _Networks(_Normal(patterns, free), product, 0.5 * patterns.weights.sum(axis=1) * _FLOOR**2)
+    networks = _Networks(
+        NormalEquations(patterns, free), product, 0.5 * patterns.weights.sum(axis=1) * _FLOOR**2
+    )
     networks.train(options)
     W, V = _split(task.W, networks.product) if task.free_V.all() else (networks.product, task.V)
-    gamma, curve = networks.normal.gamma(networks.product), networks.curve(options.max_iterations)
+    gamma = optimal_gamma(patterns.inputs @ np.swapaxes(networks.product, -1, -2), patterns.targets)
+    curve = networks.curve(options.max_iterations)
     return Trained(W, V, gamma, networks.loss, networks.iterations, networks.settled, curve)
 
 
@@ -86,7 +89,7 @@ def _split(W: Array, product: Array) -> tuple[Array, Array]:
     return np.where(keep, W, np.eye(3)), np.where(keep, V, product)
 
 
-class _Normal:
+class NormalEquations:
     """E, its gradient and Gauss-Newton matrix for the free entries of the (3, I) products."""
 
     def __init__(self, patterns: Patterns, free: NDArray[np.bool_]) -> None:
@@ -104,11 +107,6 @@ class _Normal:
         self.free = np.flatnonzero(free)
         row, column = np.divmod(self.free, n)
         self.place = outputs[row[:, None], row] * len(a) + inputs[column[:, None], column]
-
-    def gamma(self, product: Array) -> Array:
-        """Optimal factors of all networks (K, N)."""
-        o = product @ self.Zt
-        return np.asarray((o * self.dt).sum(axis=1) / (o * o).sum(axis=1))
 
     def __call__(self, product: Array, mu: float, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
         """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
@@ -140,7 +138,7 @@ _Trial = tuple[Array, Array, Array, Array]  # products, their loss, gradient and
 class _Networks:
     """All networks of a stack, trained through one stiffness after the other."""
 
-    def __init__(self, normal: _Normal, product: Array, floor: Array) -> None:
+    def __init__(self, normal: NormalEquations, product: Array, floor: Array) -> None:
         G = len(product)
         self.normal, self.product, self.floor = normal, product.copy(), floor
         self.loss = np.zeros(G)

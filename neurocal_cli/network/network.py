@@ -129,24 +129,6 @@ def e_2d(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Array:
     return np.asarray(0.5 * (patterns.weights * (error**2).sum(-1)).sum(-1))
 
 
-def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:
-    """Residuals d - gamma o (G, N, 3) with gamma eliminated, and their derivative by the product W V.
-
-    The derivative is (G, N, 3, 3, I), by the entries of the (3, I) product. The residual is the component of
-    the target perpendicular to the ray o. The derivative of gamma is along the ray and is dropped (Kaufman's
-    variable projection). The gradient is exact, and the Hessian is that of Gauss-Newton.
-    """
-    Z = patterns.inputs
-    o = output(W, V, Z)
-    gamma = optimal_gamma(o, patterns.targets)
-    ray = o / np.linalg.norm(o, axis=-1, keepdims=True)
-    across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
-    root = np.sqrt(patterns.weights)
-    residuals = root[..., None] * (patterns.targets - gamma[..., None] * o)
-    jacobian = -(root * gamma)[..., None, None, None] * across[..., None] * Z[..., None, None, :]
-    return residuals, jacobian
-
-
 def _rotation_part(V: Array) -> Array:
     """Columns of V that form the rotation; InputError for a flat board, whose third column is missing."""
     if V.shape[-1] != 4:

@@ -27,7 +27,8 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.network.network import Patterns, Task, patterns_of, residual_jacobian
+from neurocal_cli.network.levenberg_marquardt import NormalEquations
+from neurocal_cli.network.network import Patterns, Task, patterns_of
 from neurocal_cli.network.options import MOST_POINTS, Options
 from neurocal_cli.network.starts import learn
 
@@ -105,9 +106,9 @@ def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
         return
     patterns = patterns_of(problem.views, np.array([0]), False, MOST_POINTS)
     product = groups[0].product
-    _, J = residual_jacobian(np.eye(3)[None], product / np.linalg.norm(product), patterns)
-    J = J.reshape(-1, 12)
-    values = np.linalg.eigvalsh(J.T @ J)
+    normal = NormalEquations(patterns, np.ones(product.shape[1:], dtype=bool))
+    matrix = normal(product / np.linalg.norm(product), 0.0, np.array([0]))[2]
+    values = np.linalg.eigvalsh(matrix[0])
     conditions = int((values > _NO_CONDITION * values[-1]).sum())
     unknowns = int(problem.free.sum()) + 6
     if conditions < 11 and conditions <= unknowns:

@@ -20,7 +20,7 @@ from neurocal_cli.observations.marked_cells import to_print
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.simulation.rendering.layers import visible_midpoints
 from neurocal_cli.simulation.rendering.render import digitised, image_light
-from neurocal_cli.simulation.rendering.scene import Scene, Sides, Target
+from neurocal_cli.simulation.rendering.scene import Scene, Target
 
 # The camera of Table 1, whose theta of 1.5708 is a rounded right angle.
 PAPER_CAMERA = Camera(Intrinsics(556.0, 549.0, 172.0, 121.0), image_size=(352, 240))
@@ -198,7 +198,7 @@ def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
         raise InputError("there is no board to render: the scene's points are those of a file; give a board")
     planes = scene.board.planes
     # With several planes, the pattern may extend to a fold, and paper beyond it would cross the fold.
-    margin = Sides.all(_MARGIN if len(planes) == 1 else 0.0)
+    margin = _MARGIN if len(planes) == 1 else 0.0
     targets = tuple(Target(to_print(plane), margin=margin) for plane in planes)
     for number, (name, pose) in enumerate(scene.poses.items()):
         shown, rng = Scene(scene.camera, pose, targets), np.random.default_rng((seed, number))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.distorted import coefficients
 from support.image_bound import camera_bound
-from support.pictures import Rendered, Scene, Sensor, render
+from support.pictures import Rendered, Scene, Sensor, Target, render
 
 from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
@@ -17,7 +17,7 @@ from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.simulation.rendering.scene import Background, Target
+from neurocal_cli.simulation.rendering.scene import Background
 
 SIZE = (400, 300)
 TRUTH = Intrinsics(505.0, 503.0, 201.0, 148.0)

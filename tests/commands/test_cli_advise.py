@@ -26,7 +26,7 @@ from neurocal_cli.calibration.advice import (
     worst_std,
 )
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.commands.show.advice import advice_lines, board_of, draw_advice
+from neurocal_cli.commands.show.advice import advice_report, board_of, draw_advice
 from neurocal_cli.errors import InputError
 
 MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")
@@ -131,7 +131,7 @@ def test_each_view_helps_and_shows_the_whole_target() -> None:
 def test_a_target_that_is_not_flat_can_be_advised_as_well() -> None:
     advice = advise(replace(made_calibration(2), rmse_px=0.4), 1)
     assert advice.after[0] < advice.before
-    assert len(advice_lines(advice, None)) == 2
+    assert len(advice_report(advice, None).below) == 2
 
 
 def test_the_command_tells_and_draws(tmp_path: Path) -> None:

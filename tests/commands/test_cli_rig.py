@@ -130,6 +130,7 @@ def test_a_file_is_judged_as_what_it_is(made: tuple[Path, Result], tmp_path: Pat
     assert run("calibrate", SAMPLES[0], *FAST, "-o", camera).exit_code == 0
     assert run("evaluate", camera).stdout == run("evaluate", "camera", camera).stdout
     assert "nothing.yaml: there is no such file" in run("evaluate", "nothing.yaml").stderr
+    assert f"{tmp_path}: is a folder; give a file in it" in run("evaluate", tmp_path).stderr
 
 
 def test_the_rig_has_a_page(made: tuple[Path, Result], tmp_path: Path) -> None:

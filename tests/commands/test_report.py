@@ -12,8 +12,8 @@ from support.wrong_inputs import corner
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, evaluate_camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.commands.show.camera_report import calibration_report, evaluation_json, evaluation_tables
-from neurocal_cli.commands.show.text import align, rounded
+from neurocal_cli.commands.show.camera_report import calibration_report, evaluation_report
+from neurocal_cli.commands.show.text import Report, align, rounded
 from neurocal_cli.commands.streams import for_json
 
 
@@ -96,14 +96,14 @@ def test_a_calibration_without_a_network_is_reported() -> None:
 
 def test_an_evaluation_lists_axes_and_views() -> None:
     evaluation = evaluate_camera(made_calibration(2))
-    overall, views = map(align, evaluation_tables(evaluation))
+    overall, views = map(align, evaluation_report(evaluation, None, Report()).tables)
     assert any(line.startswith(f"both  {evaluation.rmse_px:.4f}") for line in overall)
     assert [line.split()[-1] for line in views[1:]] == ["calibrated"] * 2
 
 
 def test_json_has_the_promised_keys_and_all_digits() -> None:
     evaluation = evaluate_camera(made_calibration(2))
-    values = json.loads(json.dumps(evaluation_json(evaluation), allow_nan=False))
+    values = json.loads(json.dumps(evaluation_report(evaluation, None, Report()).tree, allow_nan=False))
     assert values["rmse_px"] == evaluation.rmse_px
     assert values["views"] == {name: view.rmse_px for name, view in evaluation.views.items()}
     names = {"n_points", "rmse_px", "max_px", "views", "n_behind", "fitted_views"}
@@ -114,11 +114,12 @@ def test_json_has_null_for_an_error_that_does_not_exist() -> None:
     behind = -pose_of(0).R.T @ pose_of(0).t - 50 * pose_of(0).R[2]
     points = Correspondences(behind[None], np.zeros((1, 2)), ["view00"])
     evaluation = evaluate_camera(made_calibration(), points)
-    values = for_json(evaluation_json(evaluation))
+    report = evaluation_report(evaluation, None, Report())
+    values = for_json(report.tree)
     assert values["rmse_px"] is None
     assert values["views"] == {"view00": None}
     json.dumps(values, allow_nan=False)
-    assert "-" in evaluation_tables(evaluation)[1][1]
+    assert "-" in report.tables[1][1]
 
 
 def test_names_cannot_break_the_table() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.measured import found, take
-from support.pictures import Scene, Sensor
+from support.pictures import Scene, Sensor, Target
 from support.real_data import RealFiles
 from support.rendered import condition, rendered
 from support.slow_cases import slow_but
@@ -25,7 +25,7 @@ from neurocal_cli.detection.fitting.strips import GridEdges, GridImage
 from neurocal_cli.detection.measuring import edges_served, positions_along_edges
 from neurocal_cli.files.images import read_image
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.simulation.rendering.scene import Background, Target
+from neurocal_cli.simulation.rendering.scene import Background
 
 
 def strongly_distorted() -> Scene:

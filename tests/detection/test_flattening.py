@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.marked import errors_of, plane_of, taken
-from support.pictures import Scene
+from support.pictures import Scene, Target
 from support.wide_boards import WideRecipe, wide_scene
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.wide_lens import Flattening, WideLens
-from neurocal_cli.simulation.rendering.scene import Target
 
 GROUND = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from support.occluders import Rectangle
-from support.pictures import Rendered, Scene, ground_truth
+from support.pictures import Rendered, Scene, Sides, Target, ground_truth
 from support.rendered import Recipe, board_pose, condition, folded, picture, rendered, single
 from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
 from support.slow_cases import slow_but
@@ -28,7 +28,6 @@ from neurocal_cli.detection.placement import (
     trimmed,
 )
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.simulation.rendering.scene import Sides, Target
 
 EMPTY = np.zeros((480, 640), dtype=np.uint8)
 

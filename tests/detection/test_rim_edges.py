@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from support.command_line import run
-from support.pictures import Scene
+from support.pictures import Scene, Sides
 from support.real_data import RealFiles
 from support.rendered import condition, rendered
 from support.slow_cases import slow_but
@@ -20,7 +20,6 @@ from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, board_of
-from neurocal_cli.simulation.rendering.scene import Sides
 
 SEEDS = range(4)
 

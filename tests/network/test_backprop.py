@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from support.decomposition import decompose
-from support.gradients import gradients
+from support.gradients import gradients, residual_jacobian
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
@@ -30,7 +30,6 @@ from neurocal_cli.network.network import (
     optimal_gamma,
     output,
     random_weights,
-    residual_jacobian,
 )
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.gradients import gradients
+from support.gradients import gradients, residual_jacobian
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.levenberg_marquardt import NormalEquations
 from neurocal_cli.network.network import (
     Patterns,
     e_2d,
@@ -18,7 +19,6 @@ from neurocal_cli.network.network import (
     optimal_gamma,
     output,
     random_weights,
-    residual_jacobian,
 )
 
 NETWORKS, POINTS = 3, 7
@@ -145,6 +145,18 @@ def test_residual_jacobian_is_the_derivative_of_the_residuals_for_gamma_held(n_i
 
     _, jacobian = residual_jacobian(W, V, patterns)
     assert_same(jacobian, differences(across, W @ V))
+
+
+@pytest.mark.parametrize("n_inputs", [3, 4])
+def test_the_normal_equations_are_those_of_the_residual_jacobian(n_inputs: int) -> None:
+    W, V, _, patterns = stack(n_inputs)
+    residuals, jacobian = residual_jacobian(W, V, patterns)
+    J = jacobian.reshape(NETWORKS, 3 * POINTS, -1)
+    normal = NormalEquations(patterns, np.ones((3, n_inputs), dtype=bool))
+    loss, gradient, matrix = normal(W @ V, 0.0, np.arange(NETWORKS))
+    np.testing.assert_allclose(loss, 0.5 * (residuals**2).sum(axis=(1, 2)), rtol=1e-12)
+    np.testing.assert_allclose(gradient, (residuals.reshape(NETWORKS, 1, -1) @ J)[:, 0], atol=1e-11)
+    np.testing.assert_allclose(matrix, np.swapaxes(J, 1, 2) @ J, atol=1e-11)
 
 
 @pytest.mark.parametrize("problem", FREE)

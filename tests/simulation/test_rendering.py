@@ -15,7 +15,17 @@ from hypothesis import strategies as st
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 from support.picture_bound import edge_bound, noise_free, scene_bound, vertex_bound
-from support.pictures import Illumination, Scene, Sensor, digitised, ground_truth, image_light, render
+from support.pictures import (
+    Illumination,
+    Scene,
+    Sensor,
+    Sides,
+    Target,
+    digitised,
+    ground_truth,
+    image_light,
+    render,
+)
 from support.rendered import CONDITIONS, RECIPES, condition, picture
 from support.slow_cases import slow_but
 
@@ -27,7 +37,7 @@ from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering.layers import half_plane
 from neurocal_cli.simulation.rendering.render import Blur
-from neurocal_cli.simulation.rendering.scene import Background, Sides, Target
+from neurocal_cli.simulation.rendering.scene import Background
 
 SMALL = Camera(Intrinsics(250.0, 252.0, 81.0, 58.0), image_size=(160, 120))
 PLANE = Plane("", 5, 4, 10.0)

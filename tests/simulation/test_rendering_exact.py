@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 from support.picture_bound import noise_free
-from support.pictures import Illumination, Scene, Sensor, ground_truth, image_light
+from support.pictures import Illumination, Scene, Sensor, Sides, Target, ground_truth, image_light
 from support.rendered import board_pose, condition
 from support.slow_cases import slow_but
 
@@ -20,7 +20,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.simulation.rendering.scene import Background, Sides, Target
+from neurocal_cli.simulation.rendering.scene import Background
 
 PLANE = Plane("", 5, 4, 10.0)
 EXACT = Sensor(read_noise=0.0, bits=16)

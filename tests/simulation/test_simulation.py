@@ -17,11 +17,8 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.boards import named_board
 from neurocal_cli.commands.show.methods_report import (
     draw_rates,
-    noise_json,
-    rates_json,
-    rates_tables,
-    simulation_tables,
-    text_of,
+    rates_report,
+    simulation_report,
 )
 from neurocal_cli.commands.streams import for_json
 from neurocal_cli.errors import InputError, NeurocalError
@@ -211,10 +208,10 @@ def test_the_default_rates_converge_and_others_do_not() -> None:
     assert np.isnan(study.epochs[1, 0])
     pytest.importorskip("matplotlib")
     assert draw_rates(study, "svg").startswith(b"<?xml")
-    tables, below = rates_tables(study)
-    assert tables[0][1][1:] == [["0.05", "12"], ["0.8", "0"]]
-    assert "12 of 12 data sets" in below[0]
-    assert for_json(rates_json(study))["median_epochs"][1] == [None]
+    report = rates_report(study)
+    assert report.tables[0][1:] == [["0.05", "12"], ["0.8", "0"]]
+    assert "12 of 12 data sets" in report.below[0]
+    assert for_json(report.tree)["median_epochs"][1] == [None]
 
 
 @pytest.mark.slow
@@ -268,7 +265,8 @@ def test_a_method_without_an_answer_is_counted() -> None:
     assert np.isnan(study.methods["linear"].rms).all()
     assert np.isnan(cramer_rao(scene, "linear")).all()
     assert np.isfinite(cramer_rao(scene, "tsai")).all()
-    assert "nan" not in text_of(*simulation_tables(study, None, False))
-    assert for_json(noise_json(study))["methods"]["linear"]["rms"]["t_x"] == [None]
+    report = simulation_report(scene, 0, study, None, False)
+    assert "nan" not in report.text()
+    assert for_json(report.tree)["methods"]["linear"]["rms"]["t_x"] == [None]
     with pytest.raises(NeurocalError, match="one view of one plane"):
         study_starts(scene, 0.5, 2)

@@ -15,8 +15,16 @@ from neurocal_cli.detection.detect import Detection
 from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
-from neurocal_cli.simulation.rendering.scene import Target
-from support.pictures import Illumination, Rendered, Scene, Sensor, digitised, ground_truth, image_light
+from support.pictures import (
+    Illumination,
+    Rendered,
+    Scene,
+    Sensor,
+    Target,
+    digitised,
+    ground_truth,
+    image_light,
+)
 
 EVEN = Illumination()
 

@@ -20,7 +20,6 @@ from neurocal_cli.observations.board_kinds import CirclePlane
 from neurocal_cli.simulation.rendering import render as rendering
 from neurocal_cli.simulation.rendering import scene as plain
 from neurocal_cli.simulation.rendering.layers import Mask, Sight, edges_visible
-from neurocal_cli.simulation.rendering.scene import Target
 
 _SRGB_LINEAR = 0.0031308
 _STEP = 1e-4  # squares; step of the differences that give directions in the image
@@ -51,6 +50,52 @@ class Sensor:
     def white_dn(self) -> int:
         """Largest value of a pixel."""
         return (1 << self.bits) - 1
+
+
+@frozen_dataclass
+class Sides:
+    """Lengths at the sides of a board, in squares; low and high along x_axis and y_axis."""
+
+    x_low: float = 1.0
+    x_high: float = 1.0
+    y_low: float = 1.0
+    y_high: float = 1.0
+
+    @classmethod
+    def all(cls, length: float) -> Sides:
+        """The same length on all sides."""
+        return cls(length, length, length, length)
+
+
+@frozen_dataclass
+class Target(plain.Target):
+    """A printed board with other ends."""
+
+    # Extent of the pattern beyond the outer vertices; 1 is a whole square, and 1/2 on both planes of a fold
+    # makes squares across the fold.
+    reach: Sides = field(default_factory=Sides)
+    # White paper beyond the pattern; 0 if the pattern ends at the paper's edge or at a fold.
+    margin: Sides = field(default_factory=lambda: Sides.all(0.5))  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        for sides in (self.reach, self.margin):
+            if min(sides.x_low, sides.x_high, sides.y_low, sides.y_high) < 0:
+                raise InputError("reach and margin must not be negative")
+
+    @property
+    def pattern_box(self) -> tuple[float, float, float, float]:
+        """Ends of the pattern: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
+        reach, plane = self.reach, self.plane
+        if self.printed is not None:
+            return self.printed.box
+        return -reach.x_low, plane.cols - 1 + reach.x_high, -reach.y_low, plane.rows - 1 + reach.y_high
+
+    @property
+    def paper_box(self) -> tuple[float, float, float, float]:
+        """Ends of the paper, like `pattern_box`."""
+        x_low, x_high, y_low, y_high = self.pattern_box
+        margin = self.margin
+        return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
 
 
 @frozen_dataclass

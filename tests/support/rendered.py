@@ -20,10 +20,19 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.simulation.rendering.scene import Sides, Target
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
-from support.pictures import Illumination, Rendered, Scene, Sensor, digitised, ground_truth, image_light
+from support.pictures import (
+    Illumination,
+    Rendered,
+    Scene,
+    Sensor,
+    Sides,
+    Target,
+    digitised,
+    ground_truth,
+    image_light,
+)
 
 SQUARE = 28.0  # mm
 PLAIN = Clutter()

@@ -9,9 +9,8 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.simulation.rendering.scene import Sides, Target
 from support.clutter import KINDS, Clutter
-from support.pictures import Illumination, Rendered, Scene, Sensor, render
+from support.pictures import Illumination, Rendered, Scene, Sensor, Sides, Target, render
 from support.wide_camera import ImageCircle, Law, WideCamera
 
 SQUARE = 30.0  # mm

@@ -17,7 +17,7 @@ from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import outline_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, drawing, panels_in_rows, plain, style
-from neurocal_cli.commands.show.text import attributes
+from neurocal_cli.commands.show.text import Report, attributes
 from neurocal_cli.errors import one_line
 
 if TYPE_CHECKING:
@@ -32,15 +32,18 @@ _HALF = {"h": (0.5, 0.0), "v": (0.0, 0.5)}  # from a vertex to the mid-point of 
 _PIECES = 12  # of each side of an outline
 
 
-def advice_lines(advice: Advice, verdict: Verdict | None) -> list[str]:
+def advice_report(advice: Advice, verdict: Verdict | None) -> Report:
     """The uncertainty so far, also as in the verdict, and a line for each view with that after it."""
     there = float("nan") if verdict is None else verdict.measures.get("projection_px", float("nan"))
     usual = f"; {two_digits(there)} px at that distance" if math.isfinite(there) else ""
-    return [
+    lines = [
         f"std of predicted pixels {_px(advice.before)} at most, for points at half to ten times the distance "
         f"of the views{usual}",
         *(f"{number}. {text}" for number, text in enumerate(advised_views(advice), start=1)),
     ]
+    pairs = zip(advice.views, advice.after, strict=True)
+    views = [{**_view_json(view), "worst_px": after} for view, after in pairs]
+    return Report({"worst_px": advice.before, "views": views}, below=lines)
 
 
 def advised_views(advice: Advice) -> list[str]:
@@ -74,7 +77,7 @@ def _px(value: float) -> str:
     return f"{value:.3g} px" if value < float("inf") else "unknown, as the views do not determine the camera"
 
 
-def rig_advice_lines(advice: RigAdvice) -> list[str]:
+def rig_advice_report(advice: RigAdvice) -> Report:
     """A line for each view that ties two cameras of a rig."""
     unit = one_line(advice.unit)
     lines = [
@@ -87,16 +90,11 @@ def rig_advice_lines(advice: RigAdvice) -> list[str]:
             f"{number}. {first} and {second}: in the image of {first} {_described(tie.view)}: "
             f"{tie.before:.3g} -> {tie.after:.3g} {unit}"
         )
-    return lines
-
-
-def rig_advice_json(advice: RigAdvice) -> dict[str, Any]:
-    """The same as values for JSON."""
     views = [
         {"cameras": tie.cameras, **_view_json(tie.view), **attributes(tie, "std=before std_after=after")}
         for tie in advice.views
     ]
-    return {**attributes(advice, "weakest_share=share unit"), "views": views}
+    return Report({**attributes(advice, "weakest_share=share unit"), "views": views}, below=lines)
 
 
 def _view_json(view: Candidate) -> dict[str, Any]:
@@ -104,17 +102,6 @@ def _view_json(view: Candidate) -> dict[str, Any]:
         **attributes(view, "position width tilt_deg=tilt nearer_side_deg=way roll_deg=roll"),
         **attributes(view.pose, "rotation=R translation=t"),
         "outline": view.outline,
-    }
-
-
-def advice_json(advice: Advice) -> dict[str, Any]:
-    """The advice as values for JSON."""
-    return {
-        "worst_px": advice.before,
-        "views": [
-            {**_view_json(view), "worst_px": after}
-            for view, after in zip(advice.views, advice.after, strict=True)
-        ],
     }
 
 

@@ -14,6 +14,7 @@ from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Report,
     Table,
     align,
     align_views,
@@ -171,7 +172,7 @@ def _among(calibration: Calibration) -> str:
 
 
 def calibration_json(calibration: Calibration) -> dict[str, Any]:
-    """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
+    """Convert the summary of a calibration to JSON values; numbers that are not finite become None."""
     return {
         **attributes(calibration, "camera_name image_size"),
         "n_points": len(calibration.points),
@@ -258,9 +259,8 @@ def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
     }
 
 
-def evaluation_tables(evaluation: CameraEvaluation) -> tuple[Table, Table]:
-    """Rows, the heading first, of the table of all points and of the table of views."""
-    e = evaluation
+def evaluation_report(e: CameraEvaluation, verdict: Verdict | None, since: Report) -> Report:
+    """An evaluation, with the verdict and what the points say of the calibration since it was made."""
     overall = [
         ["[px]", "rms", "bias", "max"],
         ["u", _pixels(e.rms_u), _bias(e.bias_u, e.rms_u), ""],
@@ -271,17 +271,14 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[Table, Table]:
     for name, view in e.views.items():
         numbers = [str(view.n_points), str(view.n_behind), _pixels(view.rmse_px), _pixels(view.max_px)]
         views.append([one_line(name), *numbers, "fitted" if view.fitted else "calibrated"])
-    return overall, views
-
-
-def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> dict[str, Any]:
-    """Convert an evaluation to JSON values; numbers that are not finite become None."""
-    return {
-        **attributes(evaluation, "n_points n_behind rmse_px max_px rms_u rms_v bias_u bias_v"),
-        "views": {name: view.rmse_px for name, view in evaluation.views.items()},
-        "fitted_views": evaluation.fitted_views,
+    tree = {
+        **attributes(e, "n_points n_behind rmse_px max_px rms_u rms_v bias_u bias_v"),
+        "views": {name: view.rmse_px for name, view in e.views.items()},
+        **attributes(e, "fitted_views"),
         **verdict_json(verdict),
+        **since.tree,
     }
+    return Report(tree, [overall, views], [*since.below, *verdict_lines(verdict)])
 
 
 def _decimals(value: float) -> int | None:
@@ -309,10 +306,10 @@ def _bias(value: float, rms: float) -> str:
     return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 avoids -0
 
 
-def plane_tables(errors: PlaneErrors | None, unit: str) -> list[Table]:
-    """Rows, the heading first: a length and two points, with the shares of calibration and pixels."""
+def plane_report(errors: PlaneErrors | None, unit: str) -> Report:
+    """A length and points on a plane, with the shares of calibration and pixels; nothing without errors."""
     if errors is None:
-        return []
+        return Report()
     unit = one_line(unit)
     rows = [[f"at {errors.distance:g} {unit}", f"std [{unit}]", "of calibration", "of pixels"]]
     for what, spread in (
@@ -325,13 +322,6 @@ def plane_tables(errors: PlaneErrors | None, unit: str) -> list[Table]:
             continue
         told = spread.std, spread.by_calibration, spread.by_pixel
         rows.append([what, *(rounded(std, std)[0] for std in told)])
-    return [rows]
-
-
-def plane_json(errors: PlaneErrors | None) -> dict[str, Any]:
-    """The same as an entry of JSON; none without errors."""
-    if errors is None:
-        return {}
 
     def shares(spread: Spread) -> dict[str, float]:
         return attributes(spread, "std calibration=by_calibration pixels=by_pixel")
@@ -343,19 +333,15 @@ def plane_json(errors: PlaneErrors | None) -> dict[str, Any]:
         **({} if errors.of_depth is None else {"depth": shares(errors.of_depth)}),
         "worst": shares(errors.of_worst),
     }
-    return {"at": at}
+    return Report({"at": at}, [rows])
 
 
-def position_tables(positions: Mapping[str, CameraPosition], unit: str) -> list[Table]:
-    """Rows, the heading first: where the camera was in each view; no table without views."""
+def position_report(positions: Mapping[str, CameraPosition], unit: str) -> Report:
+    """Where the camera was in each view; no table without views."""
     rows = [["camera in", *(f"{axis} [{one_line(unit)}]" for axis in "XYZ")]]
     for name, place in positions.items():
         pairs = zip(place.point.tolist(), place.std.tolist(), strict=True)
         cells = [with_std(value, std) if std > 0 else f"{value:.7g}" for value, std in pairs]
         rows.append([one_line(name), *cells])
-    return [rows] if positions else []
-
-
-def positions_json(positions: Mapping[str, CameraPosition]) -> dict[str, Any]:
-    """The same as values for JSON, with covariances."""
-    return {name: attributes(place, "point std covariance") for name, place in positions.items()}
+    tree = {name: attributes(place, "point std covariance") for name, place in positions.items()}
+    return Report({"positions": tree}, [rows] if positions else [])

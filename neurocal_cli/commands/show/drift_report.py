@@ -16,6 +16,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.figure import ACCENT, colour_bar, drawing, plain, style
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Report,
     Table,
     attributes,
     labelled,
@@ -39,17 +40,12 @@ _ARROWS = 11  # across
 _LONGEST = 0.06  # of the image's width, the longest arrow
 
 
-def drift_tables(old: Calibration | Camera, new: Calibration | Camera, drift: Drift) -> list[Table]:
-    """The parameters that both cameras have with their difference, and the differences over the image."""
-    return [table for table in (_parameter_table(old, new), _image_table(drift)) if len(table) > 1]
-
-
-def drift_lines(drift: Drift) -> list[str]:
-    """The judgement in words, and the numbers behind it."""
+def drift_report(old: Calibration | Camera, new: Calibration | Camera, drift: Drift) -> Report:
+    """The judgement, and the numbers behind it: the parameters and the differences over the image."""
     u, v = drift.pixels[drift.worst]
     scale, *centre = zip(drift.changes.tolist(), drift.changes_std.tolist(), strict=True)
     moves = [with_std(value, std) for value, std in centre]
-    return [
+    lines = [
         f"{'different' if drift.different else 'the same within chance'}: {_in_pixels(drift)}",
         f"  most clearly at ({u:.0f}, {v:.0f}): {two_digits(drift.length[drift.worst])} px, std "
         f"{two_digits(drift.std[drift.worst])} px",
@@ -58,10 +54,20 @@ def drift_lines(drift: Drift) -> list[str]:
         f"  chance: {_chance(drift.share)} of the calibrations of an unchanged camera differ as much; the "
         f"limit is {100 * SHARE:g} %",
     ]
+    rows = zip(drift.pixels, drift.difference, drift.std, strict=True)
+    tree = {
+        **drift_json(drift),
+        "parameters": {
+            name: {"old": a, "new": b, "std": std} for name, (a, b, std) in _compared(old, new).items()
+        },
+        "image": [{"u": u, "v": v, "du": du, "dv": dv, "std_px": std} for (u, v), (du, dv), std in rows],
+    }
+    tables = [table for table in (_parameter_table(old, new), _image_table(drift)) if len(table) > 1]
+    return Report(tree, tables, lines)
 
 
-def rig_drift_tables(drift: RigDrift) -> list[Table]:
-    """The differences of the cameras, and those of their poses, with the chance of each."""
+def rig_drift_report(drift: RigDrift) -> Report:
+    """The judgement on a rig: the differences of the cameras, and those of their poses, with the chances."""
     images = [["camera", "difference rms [px]", "std [px]", "chance"]]
     for name, camera in drift.cameras.items():
         images.append([name, two_digits(camera.rms_px), two_digits(camera.rms_std), _chance(camera.share)])
@@ -71,27 +77,18 @@ def rig_drift_tables(drift: RigDrift) -> list[Table]:
         sizes = (1000 * pose.turn, 1000 * pose.turn_std, pose.shift, pose.shift_std)
         cells = [two_digits(float(np.linalg.norm(one))) for one in sizes]
         poses.append([name, *cells, with_std(pose.baseline, pose.baseline_std), _chance(pose.share)])
-    return [images, poses]
-
-
-def rig_drift_lines(drift: RigDrift) -> list[str]:
-    """The judgement on a rig in words."""
     told = [f"{name} has changed" for name in drift.changed]
     told += [f"{name} has moved relative to {next(iter(drift.cameras))}" for name in drift.moved]
-    return [
+    lines = [
         f"{'different' if told else 'the same within chance'}{': ' if told else ''}{', '.join(told)}",
         f"  a chance below {100 * drift.limit:.2g} % is a change; so unchanged rigs are called different in "
         f"at most {100 * SHARE:g} % of the cases",
     ]
-
-
-def rig_drift_json(drift: RigDrift) -> dict[str, Any]:
-    """The judgement on a rig and the numbers behind it."""
-    cameras = {
+    of_cameras = {
         name: drift_json(one) | {"different": name in drift.changed, "limit": drift.limit}
         for name, one in drift.cameras.items()
     }
-    poses = {
+    of_poses = {
         name: {
             "different": name in drift.moved,
             "share": one.share,
@@ -101,18 +98,21 @@ def rig_drift_json(drift: RigDrift) -> dict[str, Any]:
         }
         for name, one in drift.poses.items()
     }
-    return {"different": drift.different, "limit": drift.limit, "cameras": cameras, "poses": poses}
+    tree = {"different": drift.different, "limit": drift.limit, "cameras": of_cameras, "poses": of_poses}
+    return Report(tree, [images, poses], lines)
 
 
-def since_line(drift: Drift | None) -> str:
+def since_report(drift: Drift | None) -> Report:
     """What new points say of an old calibration."""
     if drift is None:
-        return "these points alone do not determine the camera, so they do not tell whether it has changed"
+        unknown = "these points alone do not determine the camera, so they do not tell whether it has changed"
+        return Report(below=[unknown])
     word = "no longer holds" if drift.different else "still holds"
-    return (
+    line = (
         f"the calibration {word}: calibrated from these points, the camera differs by {_in_pixels(drift)}; "
         f"{_chance(drift.share)} of unchanged cameras differ as much"
     )
+    return Report({"drift": drift_json(drift)}, below=[line])
 
 
 def _in_pixels(drift: Drift) -> str:
@@ -136,17 +136,6 @@ def drift_json(drift: Drift) -> dict[str, Any]:
         **attributes(drift, "rms_px expected_px=rms_std"),
         "changes": {name: {"value": value, "std": std} for name, value, std in changes},
         "worst": at,
-    }
-
-
-def details_json(old: Calibration | Camera, new: Calibration | Camera, drift: Drift) -> dict[str, Any]:
-    """The parameters that both cameras have, and the differences over the image; nan becomes None."""
-    rows = zip(drift.pixels, drift.difference, drift.std, strict=True)
-    return {
-        "parameters": {
-            name: {"old": a, "new": b, "std": std} for name, (a, b, std) in _compared(old, new).items()
-        },
-        "image": [{"u": u, "v": v, "du": du, "dv": dv, "std_px": std} for (u, v), (du, dv), std in rows],
     }
 
 

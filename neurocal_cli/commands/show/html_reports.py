@@ -16,7 +16,7 @@ from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import in_plane
-from neurocal_cli.commands.show.camera_report import parameter_rows, plane_tables, target_lines
+from neurocal_cli.commands.show.camera_report import parameter_rows, plane_report, target_lines
 from neurocal_cli.commands.show.html_page import (
     Origin,
     board_shape,
@@ -266,7 +266,7 @@ def _measurements(calibration: Calibration) -> str:
         "what the image shows, and the points are relative to the camera. For other distances: neurocal "
         "evaluate camera --at."
     )
-    tables = map(table, plane_tables(calibration.errors_at(distance), calibration.unit))
+    tables = map(table, plane_report(calibration.errors_at(distance), calibration.unit).tables)
     return section("What it means for measurements", *tables, f'<p class="soft">{escape(text)}</p>')
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.commands.show.figure import ACCENT, drawing, style
 from neurocal_cli.commands.show.text import (
+    UNITS,
+    Report,
     Table,
-    align,
     attributes,
-    joined,
     number,
     parameters,
     parameters_json,
@@ -52,18 +52,24 @@ _LOOK = {
     "tsai": ("#e69f00", "^", 5.5),
     "opencv": ("#56b4e9", "+", 8.0),
 }
-_UNITS = {"alpha_u": "px", "alpha_v": "px"}
 _OWN = 0.9  # a method whose bound is below this share of the largest one has its own line
 
 
-def text_of(tables: Sequence[tuple[str, Table]], below: Sequence[str]) -> str:
-    """Format tables with titles as aligned text, and lines below them."""
-    return joined(*([title, *align(rows)] for title, rows in tables), below)
+def _titled(tree: Mapping[str, Any], tables: Sequence[tuple[str, Table]], below: Sequence[str]) -> Report:
+    """A report of tables with titles."""
+    titles, rows = zip(*tables, strict=True)
+    return Report(tree, rows, below, titles=titles)
 
 
-def comparison_report(comparison: Comparison) -> str:
+def comparison_report(comparison: Comparison) -> Report:
     """Tables of errors and of parameters for each camera, of triangulated points for two; best methods."""
     tables, below = [], []
+    tree: dict[str, Any] = {
+        "n_points": [len(points) for points in comparison.points],
+        "cameras": [
+            {method: _camera_json(one) for method, one in camera.items()} for camera in comparison.cameras
+        ],
+    }
     for side, points, camera in zip(("left", "right"), comparison.points, comparison.cameras, strict=False):
         two = len(comparison.cameras) == 2
         title, line = (f"{side} camera, ", f"{side} camera: ") if two else ("", "")
@@ -80,7 +86,15 @@ def comparison_report(comparison: Comparison) -> str:
         below += _lowest(f"{line}lowest held-out error", errors, " px")
         below += [f"{line}{method}: {one.problem}" for method, one in camera.items() if one.problem]
     if comparison.stereo is not None:
-        unit = comparison.unit
+        tree["unit"] = unit = comparison.unit
+        tree["stereo"] = {
+            method: {
+                **attributes(one.by_view, "rmse nsce"),
+                "baseline": one.baseline,
+                "rig": None if one.rig is None else attributes(one.rig, "rmse nsce"),
+            }
+            for method, one in comparison.stereo.items()
+        }
         head = ["method", f"RMSE [{unit}]", "NSCE", f"baseline [{unit}]"]
         head += [f"through one rig: RMSE [{unit}]", "NSCE"]
         rows = [head]
@@ -92,7 +106,7 @@ def comparison_report(comparison: Comparison) -> str:
         found = {method: pair.by_view for method, pair in comparison.stereo.items()}
         below += _lowest("lowest RMSE", {method: one.rmse for method, one in found.items()}, f" {unit}")
         below += _lowest("lowest NSCE", {method: one.nsce for method, one in found.items()}, "")
-    return text_of(tables, below)
+    return _titled(tree, tables, below)
 
 
 def _errors(camera: dict[str, Compared]) -> Table:
@@ -132,27 +146,6 @@ def _digits(value: float) -> str:
     return number(value, ".4g")
 
 
-def comparison_json(comparison: Comparison) -> dict[str, Any]:
-    """The comparison as values for JSON; missing numbers are None."""
-    found: dict[str, Any] = {
-        "n_points": [len(points) for points in comparison.points],
-        "cameras": [
-            {method: _camera_json(one) for method, one in camera.items()} for camera in comparison.cameras
-        ],
-    }
-    if comparison.stereo is not None:
-        found["unit"] = comparison.unit
-        found["stereo"] = {
-            method: {
-                **attributes(one.by_view, "rmse nsce"),
-                "baseline": one.baseline,
-                "rig": None if one.rig is None else attributes(one.rig, "rmse nsce"),
-            }
-            for method, one in comparison.stereo.items()
-        }
-    return found
-
-
 def _camera_json(one: Compared) -> dict[str, Any]:
     calibration = one.calibration
     if calibration is None:
@@ -165,13 +158,28 @@ def _camera_json(one: Compared) -> dict[str, Any]:
     }
 
 
-def simulation_tables(
-    study: NoiseStudy, starts: StartStudy | None, paper: bool
-) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Tables of the studies of noise and starts, and lines below them.
-
-    For the scene of the `paper`, its printed errors are shown, too.
-    """
+def simulation_report(
+    scene: SimulatedScene, seed: int, study: NoiseStudy, starts: StartStudy | None, paper: bool
+) -> Report:
+    """The studies of noise and starts; of the scene of the `paper`, its printed errors are shown, too."""
+    tree = {
+        "n_points": len(scene.world),
+        "n_views": len(scene.poses),
+        "seed": seed,
+        **attributes(study, "trials sigma parameters=names"),
+        "truth": _by_name(study, study.truth),
+        "methods": {
+            name: {
+                "error_without_noise": _by_name(study, one.exact),
+                "rms": _by_name(study, one.rms.T),
+                "bias": _by_name(study, one.bias.T),
+                "bound_for_1_px": _by_name(study, one.bound),
+                "failed": one.failed,
+            }
+            for name, one in study.methods.items()
+        },
+        "largest_difference_over_bound": {f"{a}, {b}": value for (a, b), value in study.apart.items()},
+    }
     tables = [
         ("error without noise (Table 1)", _exact(study, paper)),
         ("rms error over the noise (Fig. 1)", _fig_1(study)),
@@ -186,6 +194,11 @@ def simulation_tables(
         rows = [[_STARTS[kind][0], str(count), str(len(starts.rms[kind]))] for kind, count in found]
         title = f"single random starts that reach the minimum (noise {starts.sigma:g} px)"
         tables.append((title, [["start", "reached", "of"], *rows]))
+        tree["random_starts"] = {
+            **attributes(starts, "sigma best_rmse_px=best"),
+            "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
+            **attributes(starts, "reached rmse_px=rms"),
+        }
     below = [
         f"{a} and {b} differ by at most {apart:.1g} of the bound, in any parameter of any trial"
         for (a, b), apart in study.apart.items()
@@ -195,7 +208,7 @@ def simulation_tables(
         for method, one in study.methods.items()
         if one.failed.any()
     ]
-    return tables, below
+    return _titled(tree, tables, below)
 
 
 def _exact(study: NoiseStudy, paper: bool) -> Table:
@@ -244,8 +257,8 @@ def _bias(study: NoiseStudy, one: MethodErrors, p: int) -> str:
     return f"{one.bias[-1, p] / spread:+.1f}" if spread > 0 else "-"
 
 
-def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Tables of the data sets on which one start converges, for each pair of rates, and lines below them."""
+def rates_report(study: RateStudy) -> Report:
+    """On how many data sets one start converges, for each pair of rates, and how fast."""
     head = ["weights \\ gamma", *(f"{rate:g}" for rate in study.rates_gamma)]
     counts = [head]
     epochs = [list(head)]
@@ -260,74 +273,33 @@ def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
         f"rms, {np.abs(study.alpha_u).max():.1f} at most",
     ]
     title = f"of {study.sets} data sets, those on which a single random start converges with these rates"
-    return [(title, counts), ("median epochs of these", epochs)], below
+    tree = {
+        **attributes(study, "data_sets=sets rates_weights rates_gamma converged median_epochs=epochs"),
+        "default": {"rate_weights": weights, "rate_gamma": gamma},
+        **attributes(study, "calibrated alpha_u_errors_in_std=alpha_u"),
+    }
+    return Report(tree, [counts, epochs], below, titles=[title, "median epochs of these"])
 
 
-def rig_study_table(study: RigStudy) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Titles and rows of the table of a simulated rig, and a line below it."""
+def rig_study_report(study: RigStudy) -> Report:
+    """The errors of a simulated rig, and its true poses."""
     rows = [["sigma [px]", "rms [px]", "place [mm]", "rotation [rad]", "error / std"]]
     columns = study.sigma, study.rmse_px, study.centre, study.rotation, study.over_std
     for noise, rmse, centre, rotation, ratio in zip(*columns, strict=True):
         rows.append([f"{noise:g}", f"{rmse:.4g}", f"{centre:.4g}", f"{rotation:.3g}", f"{ratio:.2f}"])
     n, frames = len(study.rig.cameras), len(study.rig.frames)
     title = f"rms errors of {n} cameras in {plural(study.trials, 'trial')}, {frames} frames"
-    return [(title, rows)], ["error / std is 1 where the reported standard deviations are right"]
-
-
-def rig_study_json(study: RigStudy) -> dict[str, Any]:
-    """The study of a simulated rig as JSON values."""
-    return {
+    below = ["error / std is 1 where the reported standard deviations are right"]
+    tree = {
         "trials": study.trials,
-        "frames": len(study.rig.frames),
+        "frames": frames,
         **attributes(study, "sigma_px=sigma rmse_px place_mm=centre rotation_rad=rotation"),
         "error_over_std": study.over_std,
         "poses": {
             name: {"R": pose.R.tolist(), "t": pose.t.tolist()} for name, pose in study.rig.relative.items()
         },
     }
-
-
-def simulation_json(
-    scene: SimulatedScene, seed: int, study: NoiseStudy, starts: StartStudy | None
-) -> dict[str, Any]:
-    """The studies of noise and starts for JSON; missing numbers are None."""
-    counts = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
-    if starts is None:
-        return {**counts, **noise_json(study)}
-    random_starts = {
-        **attributes(starts, "sigma best_rmse_px=best"),
-        "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
-        **attributes(starts, "reached rmse_px=rms"),
-    }
-    return {**counts, **noise_json(study), "random_starts": random_starts}
-
-
-def noise_json(study: NoiseStudy) -> dict[str, Any]:
-    """The study of noise for JSON."""
-    return {
-        **attributes(study, "trials sigma parameters=names"),
-        "truth": _by_name(study, study.truth),
-        "methods": {
-            name: {
-                "error_without_noise": _by_name(study, one.exact),
-                "rms": {p: one.rms[:, k] for k, p in enumerate(study.names)},
-                "bias": {p: one.bias[:, k] for k, p in enumerate(study.names)},
-                "bound_for_1_px": _by_name(study, one.bound),
-                "failed": one.failed,
-            }
-            for name, one in study.methods.items()
-        },
-        "largest_difference_over_bound": {f"{a}, {b}": value for (a, b), value in study.apart.items()},
-    }
-
-
-def rates_json(study: RateStudy) -> dict[str, Any]:
-    """The study of rates for JSON."""
-    return {
-        **attributes(study, "data_sets=sets rates_weights rates_gamma converged median_epochs=epochs"),
-        "default": {"rate_weights": study.default[0], "rate_gamma": study.default[1]},
-        **attributes(study, "calibrated alpha_u_errors_in_std=alpha_u"),
-    }
+    return Report(tree, [rows], below, titles=[title])
 
 
 def _by_name(study: NoiseStudy, values: Any) -> dict[str, Any]:
@@ -342,7 +314,7 @@ def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kin
     with drawing((6.6, 6.0 if starts is None else 9.0), 0.1, kind) as (figure, file):
         grid = figure.add_gridspec(2 if starts is None else 3, 2)
         for n, name in enumerate(FIG_1):
-            _draw_errors(figure.add_subplot(grid[n // 2, n % 2]), study, name, _UNITS.get(name, unit), n == 0)
+            _draw_errors(figure.add_subplot(grid[n // 2, n % 2]), study, name, UNITS.get(name, unit), n == 0)
         if starts is not None:
             _draw_starts(figure.add_subplot(grid[2, :]), starts)
     return file.getvalue()

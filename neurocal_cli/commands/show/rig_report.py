@@ -11,6 +11,7 @@ from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Report,
     Table,
     align,
     align_views,
@@ -125,8 +126,8 @@ def rig_json(rig: Rig) -> dict[str, Any]:
     }
 
 
-def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
-    """Rows of the tables of all points, of the cameras and of the frames, each with its heading."""
+def rig_evaluation_report(evaluation: RigEvaluation) -> Report:
+    """The errors of all points, of the cameras and of the frames, and the verdict."""
     unit = one_line(evaluation.unit)
     x, y, z = evaluation.by_axis.tolist()
     overall = [[f"[{unit}]", "all cameras"]]
@@ -139,13 +140,7 @@ def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
     frames = [["frame", f"rms [{unit}]"]]
     worst = sorted(evaluation.frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
     frames += [[one_line(name), four_digits(error)] for name, error in worst]
-    return (overall, cameras, frames)
-
-
-def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
-    """An evaluation as JSON values; None for numbers that do not exist."""
-    x, y, z = evaluation.by_axis.tolist()
-    return {
+    tree = {
         "n_points": len(evaluation.errors),
         **attributes(evaluation, "n_behind unit rmse"),
         "rmse_x": x,
@@ -159,6 +154,7 @@ def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
         "frames": evaluation.frames,
         **verdict_json(evaluation.verdict),
     }
+    return Report(tree, [overall, cameras, frames], verdict_lines(evaluation.verdict))
 
 
 def stereo_report(rig: StereoRig) -> str:
@@ -259,8 +255,8 @@ def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
     ]
 
 
-def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
-    """Rows of the tables of all points, of the depths and of the views, each with its heading."""
+def stereo_evaluation_report(evaluation: StereoEvaluation) -> Report:
+    """The errors of all points, of the depths and of the views, and the verdict."""
     unit = evaluation.unit
     ways, heads = [evaluation.by_view], ["poses of each view"]
     if evaluation.rig is not None:
@@ -292,22 +288,19 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
     for name, (count, _) in ways[0].views.items():
         errors = [four_digits(way.views.get(name, (0, math.nan))[1]) for way in ways]
         views.append([pair_name(name, right_names[name]), str(count), *errors])
-    return (overall, depths, views) if len(views) > 2 else (overall, depths)
-
-
-def _share(value: float) -> str:
-    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
-
-
-def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
-    """An evaluation as JSON values; None for numbers that do not exist."""
-    return {
+    tree = {
         **_error_json(evaluation.by_view),
         **attributes(evaluation, "unit baseline pairs fitted_views=fitted"),
         "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
         **verdict_json(evaluation.verdict),
     }
+    tables = [overall, depths, *([views] if len(views) > 2 else [])]
+    return Report(tree, tables, verdict_lines(evaluation.verdict))
+
+
+def _share(value: float) -> str:
+    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
 
 
 def _error_json(error: SpaceError) -> dict[str, Any]:

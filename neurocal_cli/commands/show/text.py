@@ -7,13 +7,15 @@ number of decimals, so that no meaningless digit is shown.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import field
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.streams import table_width, verbose
+from neurocal_cli.commands.streams import print_summary, print_text, table_width, verbose
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
@@ -45,9 +47,32 @@ def joined(*blocks: Sequence[str]) -> str:
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
-def tabulated(tables: Iterable[Sequence[Sequence[str]]], below: Sequence[str]) -> str:
-    """Tables, and lines below them."""
-    return joined(*map(align, tables), below)
+@frozen_dataclass(eq=False)
+class Report:
+    """What a command answers: the values for JSON, and the same as tables with lines above and below."""
+
+    tree: Mapping[str, Any] = field(default_factory=dict)
+    tables: Sequence[Table] = ()
+    below: Sequence[str] = ()
+    above: Sequence[str] = ()
+    titles: Sequence[str] = ()  # of the tables, or none
+
+    def text(self) -> str:
+        """The tables and lines."""
+        titles = [[title] if title else [] for title in self.titles] or [[]] * len(self.tables)
+        blocks = [[*title, *align(rows)] for title, rows in zip(titles, self.tables, strict=True)]
+        return joined(self.above, *blocks, self.below)
+
+    def print(self, as_json: bool) -> None:
+        """Print it on stdout: as JSON, or as text for its width if it is a terminal."""
+        if as_json:
+            print_summary(self.tree)
+        else:
+            print_text(self.text)
+
+    def __or__(self, other: Report) -> Report:
+        """Both in one, tables before lines."""
+        return Report({**self.tree, **other.tree}, [*self.tables, *other.tables], [*self.below, *other.below])
 
 
 def align(rows: Iterable[Sequence[str]]) -> list[str]:

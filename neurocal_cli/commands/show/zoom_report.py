@@ -21,6 +21,7 @@ from neurocal_cli.commands.show.camera_report import target_json, target_lines
 from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, drawing, panels_in_rows, style
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Report,
     Table,
     align,
     attributes,
@@ -128,8 +129,8 @@ def camera_report(calibration: Calibration) -> str:
     return joined([f"{calibration.camera_name}: {calibration.stop_reason}"], align(rows))
 
 
-def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict) -> str:
-    """Errors of a lens as aligned text: overall, of the baselines, at the worst settings; the verdict."""
+def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict) -> Report:
+    """Errors of a lens: overall, of the baselines, at the worst settings; the verdict."""
     shown = sorted(evaluation.settings, key=lambda setting: -np.nan_to_num(setting.rmse_px))[:_MOST_SETTINGS]
     settings = [[*controls, "points", "rms [px]", "max [px]"]]
     for setting in shown:
@@ -140,9 +141,17 @@ def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], ver
         f"{_pixels(evaluation.rmse_px)} px, maximum {_pixels(evaluation.max_px)} px"
     )
     title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
-    return joined(
-        [head], align(_baseline_rows(evaluation)), [title, *align(settings)], verdict_lines(verdict)
-    )
+    tree = {
+        **attributes(evaluation, _ERRORS),
+        "settings": [
+            {name: setting.values.get(name) for name in CONTROLS} | attributes(setting, _ERRORS)
+            for setting in evaluation.settings
+        ],
+        "rivals": evaluation.baselines,
+        **verdict_json(verdict),
+    }
+    tables = [_baseline_rows(evaluation), settings]
+    return Report(tree, tables, verdict_lines(verdict), [head], ["", title])
 
 
 def _baseline_rows(evaluation: LensEvaluation) -> Table:
@@ -154,19 +163,6 @@ def _baseline_rows(evaluation: LensEvaluation) -> Table:
             joint = baselines.get(f"{name}_joint")
             rows.append([name.replace("_", " "), _pixels(alone), "" if joint is None else _pixels(joint)])
     return rows
-
-
-def evaluation_json(evaluation: LensEvaluation, verdict: Verdict) -> dict[str, Any]:
-    """An evaluation as JSON values; None for numbers that do not exist."""
-    return {
-        **attributes(evaluation, _ERRORS),
-        "settings": [
-            {name: setting.values.get(name) for name in CONTROLS} | attributes(setting, _ERRORS)
-            for setting in evaluation.settings
-        ],
-        "rivals": evaluation.baselines,
-        **verdict_json(verdict),
-    }
 
 
 def _pixels(value: float) -> str:

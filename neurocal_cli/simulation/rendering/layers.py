@@ -17,7 +17,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.simulation.rendering.scene import Cover, Occluder, Scene, Target, half_plane
+from neurocal_cli.simulation.rendering.scene import Cover, Layer, Scene, Target, half_plane
 
 # Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.
 _NEARBY = 2.0
@@ -154,14 +154,12 @@ class Composition:
     """The layers of a scene, prepared for rendering."""
 
     camera: Camera
-    boards: tuple[BoardLayer, ...]
-    occluders: tuple[Occluder, ...]
+    layers: tuple[Layer, ...]
 
     @classmethod
     def of(cls, scene: Scene) -> Composition:
         """Make the layers of a scene."""
-        boards = tuple(BoardLayer.of(scene, target) for target in scene.targets)
-        return cls(scene.camera, boards, scene.occluders)
+        return cls(scene.camera, (*scene.occluders, *(BoardLayer.of(scene, one) for one in scene.targets)))
 
     def light(
         self, rays: Rays, behind: Array, cell: float, slack: float = 0.0
@@ -170,8 +168,7 @@ class Composition:
 
         `behind` (N,) is the reflectance of the background.
         """
-        covers = [occluder.cover(rays, cell, slack) for occluder in self.occluders]
-        covers += [board.cover(rays, cell, slack) for board in self.boards]
+        covers = [layer.cover(rays, cell, slack) for layer in self.layers]
         edges = np.zeros(len(behind), dtype=np.int8)
         light, open_share = np.zeros(len(behind)), np.ones(len(behind))
         if not covers:
@@ -179,7 +176,7 @@ class Composition:
         for cover in covers:
             edges += cover.edges
         alphas, lights = np.stack([c.alpha for c in covers]), np.stack([c.light for c in covers])
-        if len(self.boards) > 1:
+        if len(covers) > 1:
             order = np.argsort([c.depth for c in covers], axis=0, kind="stable")
             alphas, lights = (np.take_along_axis(x, order, axis=0) for x in (alphas, lights))
         for alpha, own in zip(alphas, lights, strict=True):
@@ -257,8 +254,9 @@ class Sight:
         self.camera = scene.camera
         self.plane = scene.targets[index].plane
         self.matrix = scene.plane_to_camera(scene.targets[index])
-        self.others = [BoardLayer.of(scene, target) for target in scene.targets]
-        self.layer = self.others.pop(index)
+        boards = [BoardLayer.of(scene, target) for target in scene.targets]
+        self.layer = boards.pop(index)
+        self.others = (*scene.occluders, *boards)
 
     def project(self, grid: Array) -> tuple[Array, Mask]:
         """Pixels of grid coordinates, NaN if the camera does not see them, and which it sees."""
@@ -289,8 +287,6 @@ class Sight:
         with np.errstate(divide="ignore"):
             depth = np.where(w > 0, 1 / w, np.inf)
         hidden = np.zeros(len(depth), dtype=bool)
-        for occluder in self.scene.occluders:
-            hidden |= occluder.cover(rays, _TINY_CELL).alpha > 0
         for layer in self.others:
             hidden |= layer.cover(rays, _TINY_CELL).depth < depth * (1 - 1e-9)
         return np.asarray(~hidden.reshape(around.shape[:2]).any(axis=1))

@@ -161,41 +161,14 @@ def _nearest(lines: Array, place: Array) -> NDArray[np.intp]:
 
 
 @frozen_dataclass
-class Sides:
-    """Lengths at the sides of a board, in squares; low and high along x_axis and y_axis."""
-
-    x_low: float = 1.0
-    x_high: float = 1.0
-    y_low: float = 1.0
-    y_high: float = 1.0
-
-    @classmethod
-    def all(cls, length: float) -> Sides:
-        """The same length on all sides."""
-        return cls(length, length, length, length)
-
-
-@frozen_dataclass
 class Target:
-    """A printed board.
-
-    `first_black` and `reach` are those of a plain chessboard; other kinds are printed as their plane says.
-    """
+    """A printed board. `first_black` is that of a plain chessboard; other kinds are as their plane says."""
 
     plane: Plane
     black: float = 30 / 255  # reflectance of the ink
     white: float = 226 / 255  # reflectance of the paper
     first_black: bool = True  # whether the square beyond vertex (0, 0), towards growing x and y, is black
-    # Extent of the pattern beyond the outer vertices; 1 is a whole square, and 1/2 on both planes of a fold
-    # makes squares across the fold.
-    reach: Sides = field(default_factory=Sides)
-    # White paper beyond the pattern; 0 if the pattern ends at the paper's edge or at a fold.
-    margin: Sides = field(default_factory=lambda: Sides.all(0.5))
-
-    def __post_init__(self) -> None:
-        for sides in (self.reach, self.margin):
-            if min(sides.x_low, sides.x_high, sides.y_low, sides.y_high) < 0:
-                raise InputError("reach and margin must not be negative")
+    margin: float = 0.5  # squares of white paper beyond the pattern
 
     @cached_property
     def printed(self) -> Rectangles | Circles | None:
@@ -205,17 +178,15 @@ class Target:
     @property
     def pattern_box(self) -> tuple[float, float, float, float]:
         """Ends of the pattern: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
-        reach, plane = self.reach, self.plane
         if self.printed is not None:
             return self.printed.box
-        return -reach.x_low, plane.cols - 1 + reach.x_high, -reach.y_low, plane.rows - 1 + reach.y_high
+        return -1.0, float(self.plane.cols), -1.0, float(self.plane.rows)
 
     @property
     def paper_box(self) -> tuple[float, float, float, float]:
         """Ends of the paper, like `pattern_box`."""
         x_low, x_high, y_low, y_high = self.pattern_box
-        margin = self.margin
-        return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
+        return x_low - self.margin, x_high + self.margin, y_low - self.margin, y_high + self.margin
 
 
 class Cover(NamedTuple):
@@ -227,8 +198,8 @@ class Cover(NamedTuple):
     edges: NDArray[np.int8]  # number of edges in the cell
 
 
-class Occluder(Protocol):
-    """An object in front of all boards."""
+class Layer(Protocol):
+    """Something that covers a part of the image: a board, or what is in front of all boards at depth 0."""
 
     def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
         """Cover of the cells around rays; see `layers.BoardLayer.cover`."""
@@ -268,7 +239,7 @@ class Scene:
     pose: Pose  # world to camera
     targets: tuple[Target, ...] = ()  # if they overlap in the image, the nearer one hides the other
     background: Background = field(default_factory=Background)
-    occluders: tuple[Occluder, ...] = ()  # the first is in front
+    occluders: tuple[Layer, ...] = ()  # the first is in front
     illumination: Illumination = field(default_factory=Illumination)
     psf: float = 0.8  # [px] standard deviation of the Gaussian blur, without the pixel's box
 
