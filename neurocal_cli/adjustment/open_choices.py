@@ -307,18 +307,25 @@ def with_stretch(
     return opened(found, place, arrow, spread, is_stretch)[0], spread.probability
 
 
+def _solid_stretches() -> Array:
+    X, Y, Z = np.eye(3)[:, :, None] * np.eye(3)[:, None]
+    shears = [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
+    return np.stack([X - Y, (X + Y - 2 * Z) / np.sqrt(3), *shears])
+
+
+SOLID_STRETCHES = _solid_stretches()
+"""(5, 3, 3) unit deformations without a change of scale, which are the same along any axes."""
+
+
 def stretches(world: Array) -> Array:
     """(2, 3, 3) unit deformations of a plane: one side longer and the other shorter; and shear of the sides.
 
     The sides' direction follows from the points: with z = x + i y around the centre, 5 mean(z^2)^2 -
     mean(z^4) is positive for rectangles with sides along x and y, and rotates by four times the angle of the
-    sides. Of a target that is not flat, (5, 3, 3) deformations without a change of scale, which are the same
-    along any axes.
+    sides. Of a target that is not flat, `SOLID_STRETCHES`.
     """
     if not is_flat(world):
-        X, Y, Z = np.eye(3)[:, :, None] * np.eye(3)[:, None]
-        shears = [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
-        return np.stack([X - Y, (X + Y - 2 * Z) / np.sqrt(3), *shears])
+        return SOLID_STRETCHES
     centred = world - world.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
     z2 = (centred @ (axes[0] + 1j * axes[1]) / np.abs(centred).max()) ** 2  # of any unit, without overflow

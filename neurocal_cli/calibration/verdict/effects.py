@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.adjustment.normal_equations import NOTHING
+from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen
 from neurocal_cli.calibration.verdict.rival import Pattern, Steps
@@ -39,6 +40,13 @@ def stretch(seen: Seen) -> Array | None:
     if seen.by_board is None or seen.places is None:
         return None
     return seen.by_board[:, :1] * np.stack(list(seen.places), axis=1)[:, :, None]
+
+
+def deformed(seen: Seen) -> Array | None:
+    """A target that is not flat, deformed without a change of its scale."""
+    if seen.by_target is None or seen.at is None:
+        return None
+    return np.asarray(np.einsum("kij,tipn,jtn->tkpn", SOLID_STRETCHES, seen.by_target, seen.at))
 
 
 def field(seen: Seen) -> Array:

@@ -31,26 +31,27 @@ _ALONG = 1e-6  # by which a normal that is an axis of the world may differ from 
 
 @frozen_dataclass(eq=False)
 class Board:
-    """The axes of the one flat board that all views show."""
+    """The axes of the target that all views show."""
 
     centre: Array
-    axes: Array  # (3, 3) columns: along the board, across it, its normal
-    size: float  # farthest point along it [world unit]
-    aspect: float  # across over along
+    axes: Array  # (3, 3) columns: along a flat board, across it, its normal; else those of the world
+    size: float  # farthest point along the first one, or along any [world unit]
+    aspect: float  # across over along; nan if it is not flat
 
     @classmethod
-    def of(cls, views: Views) -> Board | None:
-        """Axes of the points of all views; None if they do not lie in a common plane."""
-        if not views.nearly_flat.all():
-            return None
+    def of(cls, views: Views) -> Board:
+        """Axes of the points of all views."""
         world = views.world
         centre = world.mean(axis=0)
+        solid = cls(centre, np.eye(3), float(np.abs(world - centre).max()), np.nan)
+        if not views.nearly_flat.all():
+            return solid
         axes = np.linalg.eigh((world - centre).T @ (world - centre))[1][:, ::-1]
         if np.abs(axes[:, 2]).max() > 1.0 - _ALONG:  # prints are stretched along the axes that they have
             longer, shorter, normal = np.argsort(np.abs(world - centre).max(axis=0))[::-1]
             axes = np.eye(3)[:, [longer, shorter, normal]]
         size = np.abs((world - centre) @ axes).max(axis=0)
-        return cls(centre, axes, size[0], size[1] / size[0]) if size[2] <= _FLAT * size[0] else None
+        return cls(centre, axes, size[0], size[1] / size[0]) if size[2] <= _FLAT * size[0] else solid
 
     def bend(self, height: Callable[[Array, Array], Array]) -> float:
         """Height between the highest and the lowest point [world unit], of heights over the half length."""
@@ -73,6 +74,10 @@ class Seen:
     by_board: Array | None = None
     places: Array | None = None
     to_camera: Array | None = None
+    # The derivatives along the axes of the world, and the places (3, T, n), over half the size of the target,
+    # if it is not flat.
+    by_target: Array | None = None
+    at: Array | None = None
 
 
 Effect = Callable[[Seen], Array | None]
@@ -98,7 +103,7 @@ class Linearised:
     free: NDArray[np.intp]  # columns that are estimated
     given: NDArray[np.intp]  # those of the entries of A that are given
     spare: float  # equations beyond the unknowns
-    board: Board | None
+    board: Board
 
     @property
     def alphas_free(self) -> bool:
@@ -170,7 +175,7 @@ def linearised(
 
 
 def _derivatives(
-    views: Views, state: CameraState, middle: Array, board: Board | None, effects: tuple[Effect, ...]
+    views: Views, state: CameraState, middle: Array, board: Board, effects: tuple[Effect, ...]
 ) -> Iterator[tuple[slice, Array, dict[Effect, int]]]:
     """Derivatives (T, c + 7, 2, n) of chunks of the batches, and the widths of the effects among them."""
     batches, K = views.batches, len(state.k)
@@ -188,14 +193,13 @@ def _derivatives(
             off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
         seen = Seen(J[:, :5], observed - off - middle[:, None], px)
-        if board is not None:
-            seen = _on_board(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
+        seen = _on_target(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}
         widths = {effect: part.shape[1] for effect, part in found.items()}
         yield chunk, np.concatenate([J[:, :-1], *found.values(), J[:, -1:]], axis=1), widths
 
 
-def _on_board(
+def _on_target(
     seen: Seen,
     views: Views,
     state: CameraState,
@@ -206,8 +210,10 @@ def _on_board(
 ) -> Seen:
     n, scale, back = local.shape[2], views.scale[view][:, None, None], np.swapaxes(state.R[view], 1, 2)
     world = local * scale + views.centre[view][:, :, None]
-    places = np.moveaxis(board.axes[:, :2].T @ (world - board.centre[:, None]) / board.size, 1, 0)
+    at = np.moveaxis(board.axes.T @ (world - board.centre[:, None]) / board.size, 1, 0)
     by_local = (back @ by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
     by_board = np.einsum("ia,tipn->tapn", board.axes, by_local * (board.size / scale[..., None]))
+    if np.isnan(board.aspect):
+        return replace(seen, by_target=by_board, at=at)
     to_camera = np.einsum("ia,tin->tan", board.axes, -back @ state.t[view][:, :, None] - local)
-    return replace(seen, by_board=by_board, places=places, to_camera=to_camera)
+    return replace(seen, by_board=by_board, places=at[:2], to_camera=to_camera)

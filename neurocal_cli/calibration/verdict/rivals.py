@@ -145,6 +145,16 @@ RIVALS: tuple[Rival, ...] = (
         of_board=True,
     ),
     Rival(
+        "a deformed target",
+        "the same of a target in space: one axis is longer than another, or two are not perpendicular",
+        "measure the target, and give X,Y,Z as measured",
+        words.deformed,
+        CHANGED,
+        effects.common,
+        effect=effects.deformed,
+        of_board=True,
+    ),
+    Rival(
         "a target that bends",
         "smooth residuals along the target's normal, in each view others",
         _STIFF,

@@ -230,9 +230,9 @@ def _fitted(points: Correspondences, axis: int, s: float, skew: bool = True) -> 
 
 def _refined(found: Solution, axes: tuple[int, int]) -> float:
     """By which factor the first axis is longer than the other one, as the residuals have it."""
-    stretched = causes_among(SHAPES[1:], found.problem, found.state)
+    stretched = causes_among(SHAPES[1:2], found.problem, found.state)
     board = Board.of(found.problem.views)
-    if not stretched or board is None:
+    if not stretched:
         return 1.0
     longer = float(np.exp(stretched[0].amounts[0]))  # positive beyond the linear range, too
     return longer if board.axes[axes[0], 0] else 1.0 / longer

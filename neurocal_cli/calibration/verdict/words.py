@@ -8,6 +8,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.free_networks import seen_from_behind
+from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
 from neurocal_cli.calibration.verdict.rival import Said, Say, Told
@@ -151,7 +152,6 @@ def odd_view(told: Told) -> Said:
 
 def bent(told: Told) -> Said:
     """A common bend."""
-    assert told.lin.board is not None
     terms = [(float(height), i, j) for height, (i, j) in zip(told.found.amounts, BENDS, strict=True)]
     height = told.lin.board.bend(lambda x, y: np.sum([h * x**i * y**j for h, i, j in terms], axis=0))
     return _on_board(told, f"bent by {height:.2g} {told.unit}")
@@ -159,7 +159,6 @@ def bent(told: Told) -> Said:
 
 def stretched(told: Told) -> Said:
     """A print that is stretched, or whose sides lean."""
-    assert told.lin.board is not None
     by, lean = told.found.amounts.tolist()
     longer, other = ("XYZ"[int(np.argmax(np.abs(axis)))] for axis in told.lin.board.axes.T[:2])
     if by < 0:
@@ -172,10 +171,21 @@ def stretched(told: Told) -> Said:
     return reason + (f"; {WRONG_PRINT}" if wrong else ""), size
 
 
-def _on_board(told: Told, shape: str) -> Said:
+def deformed(told: Told) -> Said:
+    """A target in space that is stretched, or whose planes lean."""
+    strain = np.einsum("k,kij->ij", told.found.amounts, SOLID_STRETCHES)
+    sides, (a, b) = np.diagonal(strain), divmod(int(np.abs(np.triu(strain, 1)).argmax()), 3)
+    longer, other = int(sides.argmax()), int(sides.argmin())
+    shape = f"longer by {100 * np.ptp(sides):.2g} % along {'XYZ'[longer]}, compared with {'XYZ'[other]}"
+    if 2 * abs(strain[a, b]) > np.ptp(sides):
+        shape = f"with {'XYZ'[a]} and {'XYZ'[b]} off a right angle by {2 * abs(strain[a, b]):.2g} rad"
+    return _on_board(told, f"a target of another shape, {shape}", "target")
+
+
+def _on_board(told: Told, shape: str, where: str = "board") -> Said:
     off = told.longer
     makes = f"makes the focal length {100 * abs(off):.2g} % too {'short' if off > 0 else 'long'}"
-    return f"the residuals repeat on the board in all views: it seems {shape}, which {makes}", abs(off)
+    return f"the residuals repeat on the {where} in all views: it seems {shape}, which {makes}", abs(off)
 
 
 def bent_view(told: Told) -> Said:

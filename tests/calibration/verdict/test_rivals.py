@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from support.wrong_inputs import by_rolling_shutter, of_cameras
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.calibration.verdict import contest as rules_of_contest
+from neurocal_cli.calibration.verdict import effects
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.contest import Contest
 from neurocal_cli.calibration.verdict.findings import LEVEL
@@ -477,8 +479,23 @@ def test_noise_that_neighbours_share_in_part_is_no_other_target() -> None:
 
 def test_solid_targets_and_single_views_have_no_shape_of_a_board() -> None:
     found = held(calibrate(table_1().points(0.2, np.random.default_rng(1))))
-    assert found.lin.board is None
+    assert effects.bends not in found.lin.columns
     assert not found.causes
+
+
+@pytest.mark.parametrize(
+    ("seed", "a", "b", "lean"), slow_but(((20009, 0, 1, 0.05),), ((20009, 0, 1, 0.05), (20000, 1, 2, -0.1)))
+)
+def test_a_target_in_space_that_leans_is_named_with_its_angle(seed: int, a: int, b: int, lean: float) -> None:
+    """A rolling shutter would explain much of it."""
+    points, _ = scene(seed)
+    deformation = np.eye(3)
+    deformation[a, b] = lean
+    said = reasons(calibrate(replace(points, world=points.world @ deformation.T)))
+    told = re.search(rf"with {'XYZ'[a]} and {'XYZ'[b]} off a right angle by ([\d.]+) rad", said)
+    assert told is not None, said
+    assert 0.8 * abs(lean) < float(told.group(1)) < 1.2 * abs(lean)
+    assert "shutter" not in said
 
 
 # Real data.
