@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.adjustment.normal_equations import NOTHING
-from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
 from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen
 from neurocal_cli.calibration.verdict.rival import Pattern, Steps
@@ -46,6 +45,8 @@ def deformed(seen: Seen) -> Array | None:
     """A target that is not flat, deformed without a change of its scale."""
     if seen.by_target is None or seen.at is None:
         return None
+    from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
+
     return np.asarray(np.einsum("kij,tipn,jtn->tkpn", SOLID_STRETCHES, seen.by_target, seen.at))
 
 

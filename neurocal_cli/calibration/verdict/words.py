@@ -8,7 +8,6 @@ import numpy as np
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.free_networks import seen_from_behind
-from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
 from neurocal_cli.calibration.verdict.rival import Said, Say, Told
@@ -173,6 +172,8 @@ def stretched(told: Told) -> Said:
 
 def deformed(told: Told) -> Said:
     """A target in space that is stretched, or whose planes lean."""
+    from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
+
     strain = np.einsum("k,kij->ij", told.found.amounts, SOLID_STRETCHES)
     sides, (a, b) = np.diagonal(strain), divmod(int(np.abs(np.triu(strain, 1)).argmax()), 3)
     longer, other = int(sides.argmax()), int(sides.argmin())
