@@ -138,8 +138,8 @@ def calibrate(
         With ``distortion="auto"``, a model to select unless another predicts decidedly better, such as that
         of the other camera of a rig.
     start : Calibration, optional
-        Of the same points, such as on another target or with another model: it starts there, instead of from
-        random weights. Its lens and its outliers are judged again.
+        Of the same points on another target: it starts there, instead of from random weights, if the same
+        parameters are given. Its lens and its outliers are judged again.
     fix : dict of float by name, optional
         Parameters that are known, and stay as they are: alpha_u, alpha_v, u0, v0 [px], and coefficients of a
         named distortion model.
@@ -285,11 +285,7 @@ def _solved(
     problem: Problem, options: Options, outliers: str, choice: str, start: Calibration | None = None
 ) -> tuple[Solution, Rejected]:
     """Fit with the neural method and the chosen options. Imports are local: only what is needed is loaded."""
-    known = None
-    if start is not None:
-        from neurocal_cli.calibration.target_choice import solution_of
-
-        known = solution_of(start), start.rejected
+    known = None if start is None else _known(problem, options, start)
     if outliers == "reject":
         from neurocal_cli.calibration.outlier_rejection import fit_robustly
 
@@ -307,6 +303,28 @@ def _solved(
 
         solution = with_all_minima(solution)
     return solution, rejected
+
+
+def _known(problem: Problem, options: Options, start: Calibration) -> tuple[Solution, Rejected] | None:
+    """The solution and the outliers of a calibration to start from; None if something else was given then.
+
+    Raises `UsageError` if it has other views.
+    """
+    from neurocal_cli.calibration.target_choice import solution_of
+
+    made = isinstance(start, Calibration) and start.network is not None
+    if not made or set(problem.points.view_names) - set(start.views) - set(start.rejected.views):
+        raise UsageError("start must be a calibration of these points by the method neuro; leave it out")
+    solution = solution_of(start)
+    before, given = solution.problem, ~problem.free
+    same = problem.type == before.type and problem.type in (1, 2) and problem.square == before.square
+    same &= problem.held == before.held and np.array_equal(problem.free, before.free)
+    same &= np.allclose(problem.entries[given], before.entries[given])
+    if options.distortion != "auto":
+        same &= problem.distortion.model == before.distortion.model
+    n = len(before.points) + len(start.rejected)
+    rejected = start.rejected if start.rejected.rows is not None and n == len(problem.points) else Rejected()
+    return (solution, rejected) if same else None
 
 
 def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:

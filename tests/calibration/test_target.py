@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.calibration.target_choice import on_one_target
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError, InputError, UsageError
 from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.points_csv import read_points
@@ -193,6 +194,32 @@ def test_a_calibration_goes_on_from_another_ones_camera_and_outliers_on_another_
     assert given.network is not None
     assert goes_on.network is not None
     assert goes_on.network.starts == given.network.starts
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"distortion": "k1"},
+        {"type": 2, "image_center": (320.0, 240.0)},
+        {"skew": True},
+        {"fix": {"u0": 320.0}},
+    ],
+)
+def test_a_calibration_starts_anew_if_other_parameters_are_given(other: dict[str, Any]) -> None:
+    points = read_points(str(SAMPLE))
+    start = calibrate(points, target="given", skew=False, distortion="none", outliers="keep")
+    options = {"target": "given", "skew": False, "distortion": "none", "outliers": "keep", **other}
+    anew, goes_on = (calibrate(points, **options, start=one) for one in (None, start))
+    assert goes_on.intrinsics == anew.intrinsics
+    assert goes_on.distortion_model == anew.distortion_model
+    assert goes_on.type == anew.type
+
+
+def test_a_calibration_of_other_points_is_no_start() -> None:
+    points = read_points(str(SAMPLE))
+    start = calibrate(points.select(points.view_index < 3), target="given", distortion="none")
+    with pytest.raises(UsageError, match="start must be a calibration of these points"):
+        calibrate(points, start=start)
 
 
 def test_other_methods_take_the_target_as_given() -> None:
