@@ -440,7 +440,7 @@ CAUSES: dict[str, str] = {
     "columns and rows swapped in reading": "pixels do not match the points",
     "rows read to and fro": "(seen at point p",
     "u and v swapped": "u and v, were exchanged",
-    "squares 10 % too long along X": "not square",
+    "squares 10 % too long along X": "longer along Y, compared with X",
     "squares 5 % too long along Y": "not square",
     "X in mm, Y in cm": "not square",
     "X in inches, Y in mm, the board turned": "X is 25.4 times as long as given",

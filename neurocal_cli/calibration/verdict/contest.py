@@ -110,8 +110,12 @@ def contest(
         if all(one.pattern == "all" for one in held.causes):
             return held
         lin = at_minimum(field)
-        smooth = estimates(lin, held.n, (NEIGHBOURS,))
-        if not smooth or sum(one.evidence for one in held.causes) > smooth[0].evidence + LEVEL:
+        smooth, beside = estimates(lin, held.n, (NEIGHBOURS,)), lin
+        for one in held.causes:
+            beside = including(beside, one)
+        # What the causes leave, such as what is not linear in them, may be noise that neighbours share, too.
+        found = [*held.causes, *estimates(beside, held.n, (NEIGHBOURS,), 0.0)[:1]]
+        if not smooth or sum(max(one.evidence, 0.0) for one in found) > smooth[0].evidence + LEVEL:
             return held
         of_all = tuple(rival for rival in RIVALS if rival.patterns is common)
         return _held(including(lin, smooth[0]), worth, of_all)
