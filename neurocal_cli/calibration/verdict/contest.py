@@ -62,7 +62,7 @@ class Contest:
     @property
     def of_all_views(self) -> bool:
         """Whether a cause that all views share, but not the target's shape, explains most of the error."""
-        first = self.causes[0] if self.explained >= EXPLAINED else None
+        first = next((one for one in self.causes[:1] if one.explained >= EXPLAINED), None)
         return first is not None and first.pattern == "all" and not first.rival.of_board
 
     def instead_of_target(self, worth: float = 1.0) -> float:
