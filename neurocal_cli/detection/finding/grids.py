@@ -22,7 +22,12 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.appearance import are_squares
 from neurocal_cli.detection.finding.grow import grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
-from neurocal_cli.detection.finding.links import Links, find_links, find_seeds, linked_group
+from neurocal_cli.detection.finding.links import (
+    Links,
+    find_links,
+    find_seeds,
+    lattice_from_links,
+)
 from neurocal_cli.detection.finding.overlaps import (
     drop_duplicates,
     merge_lattices,
@@ -158,39 +163,30 @@ def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozense
     seeds, tries = find_seeds(links), _TRIES
     found: list[Lattice] = []
     saddles = links.saddles
-    free = np.ones(len(saddles), dtype=bool)
+    free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
     nearest = _nearest_whole(known, wanted)
     sides = _sides(saddles.points[seeds]) if wanted and len(seeds) else np.full(len(seeds), np.inf)
     for seed, side in zip(seeds, sides.tolist(), strict=True):
         if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
-        linked = _linked(links, int(seed[1, 1]))
-        grid = refined(level, linked, linked.derivative_sigma, 1)
-        if level.scale == 1 or not grid.seen.all():  # finer levels complete others
-            grid = grow(level, grid)
-        grid = remove_outliers(level, grid)
+        lattice = lattice_from_links(level, links, int(seed[1, 1]), taken)
+        if lattice is not None and lattice.seen.all() and level.scale > 1:
+            grid = lattice  # finer levels complete it
+        else:
+            first = Lattice(saddles.points[seed], saddles.contrast[seed], 0)
+            grid = remove_outliers(level, grow(level, first if lattice is None else lattice))
         boards = [x for x in _boards(grid) if is_smooth(level, x)]
         if boards:
             found += boards
             nearest = max(nearest, _nearest_whole(boards, wanted))
-            free &= _mask(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
+            taken |= _mask(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] > 0
+            free &= ~taken
         else:
             tries -= 1
         if tries <= 0:
             break
     return found
-
-
-def _linked(links: Links, middle: int) -> Lattice:
-    """The lattice that links from a saddle make, whose port 0 points along c."""
-    places, members = linked_group(links, middle)
-    cols, rows = places.max(axis=0) + 1
-    at = places[:, 1], places[:, 0]
-    pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
-    pixels[at], contrast[at] = links.saddles.points[members], links.saddles.contrast[members]
-    # The square between ports 0 and 1 of the middle saddle is dark.
-    return Lattice(pixels, contrast, int(places[members == middle].sum()) % 2).cropped()
 
 
 def _find_slivers(level: Level, links: Links) -> list[Lattice]:
