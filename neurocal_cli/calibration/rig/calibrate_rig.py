@@ -313,7 +313,7 @@ def _stereo(rig: Rig) -> StereoRig:
 def _swapped(rig: StereoRig) -> tuple[str, ...]:
     """A warning where the right camera is on the left."""
     centre = -rig.R.T @ rig.t  # of the right camera in the left camera's frame
-    if centre[0] >= 0 or abs(centre[0]) <= abs(centre[1]):
+    if centre[0] >= 0 or abs(centre[0]) <= np.abs(centre[1:]).max():
         return ()
     return (
         f"the right camera is {-centre[0]:.4g} {rig.unit} to the left of the left one; if they "

@@ -192,16 +192,22 @@ def _distance(problem: RigProblem, poses: _Poses, R: Array, t: Array) -> Array:
     targets = [
         offsets @ np.swapaxes(R_k, 1, 2) + m_k[:, None, :] for R_k, m_k in zip(poses.R, poses.m, strict=True)
     ]
-    # (H, P, 5, 3): the targets in the right camera's frame, as each rig predicts them.
-    through = np.einsum("hij,pnj->hpni", R, targets[0]) + t[:, None, None, :]
-    focal = problem.cameras[1].entries[0, [0, 2]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        image = targets[1][..., :2] / targets[1][..., 2:] * focal
-        guess = np.where(through[..., 2:] > 0, through[..., :2] / through[..., 2:], np.inf) * focal
-        apart = np.sqrt(((guess - image) ** 2).sum(axis=-1).mean(axis=-1))
-    size = np.sqrt(((image - image[:, :1]) ** 2).sum(axis=-1).mean(axis=-1))
+    # (H, P, 5, 3): the targets in the right camera's frame, as each rig predicts them. Directions are
+    # compared, because a wide lens sees what is beside and behind it.
+    through = _directions(np.einsum("hij,pnj->hpni", R, targets[0]) + t[:, None, None, :])
+    seen = _directions(targets[1])
+    focal = np.sqrt(problem.cameras[1].entries[0, [0, 2]].prod())
+    apart, size = (
+        focal * np.sqrt((difference**2).sum(axis=-1).mean(axis=-1))
+        for difference in (through - seen, seen - seen[:, :1])
+    )
     noise = _SIGMAS / np.sqrt(problem.observations[1].weight)
     return np.asarray(apart / np.maximum(_SHARE * size, noise))
+
+
+def _directions(X: Array) -> Array:
+    """Unit vectors towards points (..., 3)."""
+    return X / np.maximum(np.linalg.norm(X, axis=-1, keepdims=True), 1e-300)
 
 
 def _common_fault(
@@ -254,9 +260,9 @@ def _mean_rig(poses: _Poses, agree: NDArray[np.bool_]) -> Pose:
         return Pose(np.eye(3), np.zeros(3))
     R = nearest_rotation((poses.R[1][agree] @ np.swapaxes(poses.R[0][agree], 1, 2)).sum(axis=0))
     # The centre of a far target is less certain.
-    depth = poses.m[1][agree, 2]
+    away = np.linalg.norm(poses.m[1][agree], axis=1)
     t = poses.m[1][agree] - poses.m[0][agree] @ R.T
-    return Pose(R, np.average(t, axis=0, weights=1.0 / np.maximum(depth, 1e-300) ** 2))
+    return Pose(R, np.average(t, axis=0, weights=1.0 / away**2))
 
 
 def with_agreeing_poses(cameras: list[Calibration], views: FrameNames) -> list[Calibration]:

@@ -131,7 +131,7 @@ def shared_covariance(fit: RigFit) -> Array:
 
 
 def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
-    """Depths of points that two cameras see, in the first of them, and their std for exact pixels.
+    """Depths of points that two cameras see, along the rays of the first, and their std for exact pixels.
 
     Both are (N,) in world units, of some points that are evenly spaced over the frames of both; nan for
     points that are behind a camera, and empty without common points.
@@ -155,11 +155,12 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     points = (found.points[kept] - one.t) @ one.R
     sees = np.isin(np.arange(len(problem.cameras)), (first, second))
     moves, _ = point_moves(fit, points, np.repeat(sees[:, None], len(points), axis=1))
-    down = state.R[first][2] @ moves
-    if first:
-        down[:, state.columns.rigs[first]] += in_camera(fit, points, first)[1][:, 2]
     depth, std = np.full(len(kept), np.nan), np.full(len(kept), np.nan)
-    depth[kept] = found.points[kept, 2]
+    depth[kept] = np.linalg.norm(found.points[kept], axis=1)
+    rays = (found.points[kept] / depth[kept, None])[:, None]
+    down = (rays @ state.R[first] @ moves)[:, 0]
+    if first:
+        down[:, state.columns.rigs[first]] += (rays @ in_camera(fit, points, first)[1])[:, 0]
     variance = np.einsum("ni,ij,nj->n", down, shared_covariance(fit), down)
     std[kept] = np.sqrt(np.maximum(variance, 0.0))
     return depth, std

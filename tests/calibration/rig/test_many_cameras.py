@@ -11,7 +11,7 @@ from support.many_cameras import errors_over_std, joined, moved, of_frames, scen
 from support.rigs import all_residuals
 from support.slow_cases import slow_but
 
-from neurocal_cli import Pose, calibrate, calibrate_stereo
+from neurocal_cli import Camera, Intrinsics, Pose, calibrate, calibrate_stereo
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, rig_problem
@@ -22,11 +22,11 @@ from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import match_views
 from neurocal_cli.calibration.rig.motion import motion_of, timed
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
-from neurocal_cli.simulation.rigs import random_rig
+from neurocal_cli.simulation.rigs import SimulatedRig, random_rig
 
 
 def made(n: int = 3, frames: int = 6, late: float = 0.0) -> tuple[RigProblem, RigState]:
@@ -174,6 +174,33 @@ def test_fisheyes_among_other_lenses_and_a_board_that_is_bent() -> None:
     assert rig.cameras["cam0"].distortion_model == "fisheye"
     assert rig.cameras["cam0"].target is rig.cameras["cam2"].target is not None
     assert np.abs(errors_over_std(rig, truth)).max() < 4.5
+
+
+def test_two_fisheyes_back_to_back_share_what_is_beside_both() -> None:
+    rng = np.random.default_rng(2)
+    lens = Distortion("fisheye", np.array([-0.02, -0.003, 0.0003, 0.0]))
+    camera = Camera(Intrinsics(560.0, 560.0, 955.0, 961.0), lens, (1920, 1920))
+    mounted = {
+        "left": Pose(np.eye(3), np.zeros(3)),
+        "right": Pose(np.diag([-1.0, 1, -1]), np.array([0, 0, -24.0])),
+    }
+    board = np.array([(40.0 * x, 40.0 * y, 0.0) for y in range(8) for x in range(11)])
+    frames = {}
+    for k in range(20):
+        towards = rng.normal(size=3) * [1.0, 1.0, 0.3]
+        normal = towards / np.linalg.norm(towards) + rng.normal(0, 0.15, 3)
+        z = normal / np.linalg.norm(normal)
+        x = np.cross(rng.normal(size=3), z)
+        x /= np.linalg.norm(x)
+        R = np.column_stack([x, np.cross(z, x), z])
+        frames[f"{k:03d}"] = Pose(R, 350.0 * towards / np.linalg.norm(towards) - R @ board.mean(axis=0))
+    truth = SimulatedRig({"left": camera, "right": camera}, mounted, board, frames)
+    pair = calibrate_stereo(*truth.points(0.2, rng).values(), skew=False, distortion="fisheye")
+    assert np.abs(errors_over_std(of_two(pair), truth)).max() < 4.5
+    assert pair.verdict is not None
+    assert pair.verdict.word == "good"
+    assert 0 < pair.verdict.measures["depth_share"] < 0.005
+    assert not any("swapped" in warning for warning in pair.warnings)
 
 
 def test_frames_are_views_of_one_name_with_or_without_the_camera() -> None:
