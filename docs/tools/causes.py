@@ -14,12 +14,13 @@ HEAD = "| cause | what the data look like | shared by | advice |\n| --- | --- | 
 
 
 def table() -> str:
-    """One row for each cause of a camera, of its rows and of a rig, and for each of its looks."""
+    """One row for each cause of a camera, of its rows, of a rig, of matches and of a zoom lens."""
     sys.path[:0] = [str(ROOT)]
-    from neurocal_cli.calibration.rig.causes import CAUSES
+    from neurocal_cli.calibration.rig import causes, triangulation
     from neurocal_cli.calibration.verdict import effects
     from neurocal_cli.calibration.verdict.mistakes import MISTAKES
     from neurocal_cli.calibration.verdict.rivals import RIVALS
+    from neurocal_cli.calibration.zoom import judgement
 
     shared = {
         effects.common: "all views",
@@ -30,7 +31,10 @@ def table() -> str:
     }
     rows = [(one, shared[one.patterns]) for one in RIVALS]
     rows += [(one, "one view, or all") for one in MISTAKES]
-    rows += [(one, f"{'all cameras' if one.of_all else 'a camera'} of a rig") for one in CAUSES]
+    rows += [(one, f"{'all cameras' if one.of_all else 'a camera'} of a rig") for one in causes.CAUSES]
+    rows.append((causes.MIXED_UNITS, "all cameras of a rig"))
+    rows += [(one, "all matches") for one in triangulation.MISTAKES]
+    rows += [(one, f"{'one setting' if one.of_one else 'all settings'}") for one in judgement.CAUSES]
     told = dict.fromkeys(f"| {one.cause} | {one.looks} | {who} | {one.advice} |\n" for one, who in rows)
     return HEAD + "".join(told)
 

@@ -37,7 +37,6 @@ from neurocal_cli.calibration.verdict.findings import (
     Finding,
     Limit,
     name_some,
-    or_else,
     verdict_of,
 )
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -280,11 +279,8 @@ def _frames(rig: Rig, e: _Evidence) -> Iterator[Finding]:
             SAME_MOMENT,
         )
     if e.cause is not None:
-        yield (
-            max(1, _SCATTER.grade(e.scatter), CONTRADICTION.grade(e.growth), e.cause.grade),
-            e.cause.text + or_else(e.cause.others),
-            e.cause.advice,
-        )
+        grade, reason, advice = e.cause.told.finding(e.cause, e.cause.others)
+        yield max(1, _SCATTER.grade(e.scatter), CONTRADICTION.grade(e.growth), grade), reason, advice
         return
     why = (
         "the images of a frame were not taken at the same moment, or the cameras are not fixed to each other"

@@ -21,8 +21,16 @@ from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.problem import Motion, RigProblem
 from neurocal_cli.calibration.verdict.effects import step
-from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, Limit, in_sequence, likeliest
-from neurocal_cli.calibration.verdict.rival import ABSORBED, Cause, Found, Known, Pattern, Said, Unknowns
+from neurocal_cli.calibration.verdict.findings import (
+    EXPLAINED,
+    LEVEL,
+    Cause,
+    Limit,
+    Said,
+    in_sequence,
+    likeliest,
+)
+from neurocal_cli.calibration.verdict.rival import ABSORBED, Found, Known, Pattern, Unknowns
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 
@@ -55,28 +63,15 @@ class Named:
         return float(self.found.amounts[0])
 
     @property
-    def grade(self) -> int:
-        """What its amount means for the rig."""
-        return self.cause.limit.grade(self.cause.say(self)[1])
-
-    @property
-    def mixes_units(self) -> bool:
-        """Whether the rig changed because X,Y,Z did."""
-        return self.cause in TWO_GEOMETRIES and not 1 / _OTHER_SIZE < self.size < _OTHER_SIZE
+    def told(self) -> Cause[Named]:
+        """The cause that is told: X,Y,Z where the rig changed because they did."""
+        mixed = self.cause in TWO_GEOMETRIES and not 1 / _OTHER_SIZE < self.size < _OTHER_SIZE
+        return MIXED_UNITS if mixed else self.cause
 
     @property
     def text(self) -> str:
         """What is wrong."""
-        if self.mixes_units:
-            return f"the targets became {self.size:.3g} times as large, by their X,Y,Z, {self.between}"
-        return self.cause.say(self)[0]
-
-    @property
-    def advice(self) -> str:
-        """What to do."""
-        return (
-            "check the unit of X,Y,Z and the size of the squares" if self.mixes_units else self.cause.advice
-        )
+        return self.told.say(self)[0]
 
     @property
     def camera(self) -> str:
@@ -146,6 +141,10 @@ def _is_late(found: Named) -> Said:
     )
 
 
+def _has_mixed_units(found: Named) -> Said:
+    return f"the targets became {found.size:.3g} times as large, by their X,Y,Z, {found.between}", np.inf
+
+
 def _has_zoomed(found: Named) -> Said:
     whose = "lengths of all cameras" if found.side < 0 else f"length of {found.camera}"
     by = f"{100 * found.amount:+.2g} %"
@@ -183,6 +182,11 @@ SAME_MOMENT = "trigger all cameras at the same moment, or hold the target still"
 _LOCK = "calibrate each part by itself, and lock zoom and focus"
 _UNIT = "check the unit of X,Y,Z and the size of the squares in this camera's points"
 _ANY, _MATTERS, _ZOOMED = Limit(0.0, np.inf), Limit(0.0, 0.01), Limit(0.0, 0.005)  # of relative sizes
+MIXED_UNITS = Cause(
+    "X,Y,Z in another unit from some frame on", "the frames change as those of a camera that moved, and the "
+    "targets change their size at the same time", "check the unit of X,Y,Z and the size of the squares",
+    _has_mixed_units, _ANY,
+)  # fmt: skip
 MOVED_CAMERA = RigCause(
     "a camera that moved", "from some frame on, its pose in the rig is another one", EACH_PART, _has_moved,
     _ANY, True, _pose,

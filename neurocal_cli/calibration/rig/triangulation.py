@@ -12,7 +12,7 @@ at a time. The likeliest is told by the rule and the level of all causes, if mos
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, get_args, overload
 
@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.many_views import Sightings
-from neurocal_cli.calibration.rig.rectification import rectify
+from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify
 from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.two_view_points import PointBatch
-from neurocal_cli.calibration.verdict.findings import EXPLAINED, likeliest, log_odds
+from neurocal_cli.calibration.verdict.findings import (
+    EXPLAINED,
+    POOR,
+    Mistake,
+    likeliest,
+    log_odds,
+    said,
+)
 from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
@@ -40,8 +47,6 @@ METHODS = get_args(Method)
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
 _FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
-
-_Try = tuple[tuple[Camera, Camera], Pose, Array, Array]
 
 
 @frozen_dataclass(eq=False)
@@ -231,61 +236,98 @@ def epipolar_limit(sigma: float) -> float:
     return _EPIPOLAR_SIGMAS * sigma
 
 
+@frozen_dataclass(eq=False)
+class Matches:
+    """Pixels of the same points in both cameras of a rig."""
+
+    rig: StereoRig
+    cameras: Sequence[Camera]
+    pose: Pose
+    left: Array  # (N, 2) [px]
+    right: Array
+
+    @property
+    def errors(self) -> Array:
+        """(N,) epipolar errors [px]; infinite for points behind a camera."""
+        first, second = self.cameras
+        found = triangulate(first, second, self.pose, self.left, self.right)
+        return np.where(found.behind, np.inf, found.epipolar)
+
+
+def _scaled(by: float) -> Callable[[Matches], Matches]:
+    return lambda m: replace(m, left=by * (m.left + 0.5) - 0.5, right=by * (m.right + 0.5) - 0.5)
+
+
+def _rectified(m: Matches) -> Matches | None:
+    if rectify(m.rig) is None:
+        return None
+    pair = rectified_pair(m.rig)
+    return replace(m, cameras=pair.cameras, pose=Pose(np.eye(3), pair.rotations[1] @ m.pose.t))
+
+
+_ORIGINALS = "give pixels of the original images"
+_CONVENTION = "R and t of the rig do not map the left camera to the right one, but"
+_TRIED: tuple[tuple[str, str, Callable[[Matches], Matches | None]], ...] = (
+    (
+        "the left and the right pixels are exchanged", "give uL,vL of the left camera",
+        lambda m: replace(m, left=m.right, right=m.left),
+    ),
+    (
+        "u and v are exchanged", "name the columns in their order",
+        lambda m: replace(m, left=m.left[:, ::-1], right=m.right[:, ::-1]),
+    ),
+    (
+        "the pixels are of images of half the size", "give pixels of images of the calibrated size",
+        _scaled(2.0),
+    ),
+    (
+        "the pixels are of images of twice the size", "give pixels of images of the calibrated size",
+        _scaled(0.5),
+    ),
+    (
+        "the pixels are undistorted already", _ORIGINALS,
+        lambda m: replace(m, cameras=[replace(one, distortion=Distortion()) for one in m.cameras]),
+    ),
+    ("the pixels are those of rectified images", _ORIGINALS, _rectified),
+    (
+        f"{_CONVENTION} their inverse does", "correct the rig",
+        lambda m: replace(m, pose=Pose(m.pose.R.T, -m.pose.R.T @ m.pose.t)),
+    ),
+    (
+        f"{_CONVENTION} -t instead of t does", "correct the rig",
+        lambda m: replace(m, pose=Pose(m.pose.R, -m.pose.t)),
+    ),
+    (
+        f"{_CONVENTION} the transposed R does", "correct the rig",
+        lambda m: replace(m, pose=Pose(m.pose.R.T, m.pose.t)),
+    ),
+)  # fmt: skip
+MISTAKES = tuple(
+    Mistake(text, "without it, most matches fit the rig", advice, said(text), POOR, mended)
+    for text, advice, mended in _TRIED
+)
+"""Mistakes in matches, and in the rig."""
+
+
 def fault_of_matches(rig: StereoRig, left: Array, right: Array, limit: float) -> str:
     """Name the mistake that keeps matches (N, 2) and (N, 2) [px] from fitting a rig, and what to do.
 
     `limit` is the largest epipolar error [px] of a match that fits. "" if no known mistake explains them.
     """
     if are_normalised(np.concatenate([left, right])):
-        return "the numbers are normalised coordinates, not pixels; give pixels of the original images"
-    sigma, errors = limit / _EPIPOLAR_SIGMAS, dict[str, Array]()
-    for what, tried in (
-        ("", ((rig.left.camera, rig.right.camera), rig.pose, left, right)),
-        *_tries(rig, left, right),
-    ):
-        (first, second), pose, a, b = tried
-        found = triangulate(first, second, pose, a, b)
-        errors[what] = np.where(found.behind, np.inf, found.epipolar)
-    rectified = rectify(rig)
-    if rectified is not None:
-        across = 1 if rectified.P2[0, 3] != 0 else 0
-        what = "the pixels are those of rectified images; give pixels of the original images"
-        errors[what] = np.abs(left - right)[:, across]
+        return f"the numbers are normalised coordinates, not pixels; {_ORIGINALS}"
+    given = Matches(rig, (rig.left.camera, rig.right.camera), rig.pose, left, right)
+    tried = [(one, mended.errors) for one in MISTAKES if (mended := one.mended(given)) is not None]
     # Matches that are wrong in addition count little: the mean of the logarithms.
-    largest = np.ptp(np.concatenate([left, right]))
-    squares = {
-        what: float(np.exp(np.log(np.fmin(error, largest) ** 2 + sigma**2).mean()))
-        for what, error in errors.items()
-    }
-    n, choices = len(left), len(errors) - 1
+    sigma, largest = limit / _EPIPOLAR_SIGMAS, np.ptp(np.concatenate([left, right]))
+
+    def squared(errors: Array) -> float:
+        return float(np.exp(np.log(np.fmin(errors, largest) ** 2 + sigma**2).mean()))
+
+    before = squared(given.errors)
     told = likeliest(
-        (log_odds(squares[""], squares[what], n, choices=choices), what)
-        for what, error in errors.items()
-        if what and (error <= limit).mean() > EXPLAINED
+        (log_odds(before, squared(errors), len(left), choices=len(tried)), one)
+        for one, errors in tried
+        if (errors <= limit).mean() > EXPLAINED
     )
-    return next(iter(told), "")
-
-
-def _tries(rig: StereoRig, left: Array, right: Array) -> Iterator[tuple[str, _Try]]:
-    """Each mistake with what to do, and the cameras, the rig and the pixels without it."""
-    cameras, pose = (rig.left.camera, rig.right.camera), rig.pose
-    sides = "the left and the right pixels are exchanged; give uL,vL of the left camera"
-    yield sides, (cameras, pose, right, left)
-    u_v = "u and v are exchanged; name the columns in their order"
-    yield u_v, (cameras, pose, left[:, ::-1], right[:, ::-1])
-    for size, factor in (("half", 2.0), ("twice", 0.5)):
-        resized = f"the pixels are of images of {size} the size; give pixels of images of the calibrated size"
-        yield resized, (cameras, pose, factor * (left + 0.5) - 0.5, factor * (right + 0.5) - 0.5)
-    if any(not camera.distortion.is_identity for camera in cameras):
-        first, second = (replace(camera, distortion=Distortion()) for camera in cameras)
-        undistorted = "the pixels are undistorted already; give pixels of the original images"
-        yield undistorted, ((first, second), pose, left, right)
-    R, t = pose.R, pose.t
-    others = {
-        "their inverse does": Pose(R.T, -R.T @ t),
-        "-t instead of t does": Pose(R, -t),
-        "the transposed R does": Pose(R.T, t),
-    }
-    for how, other in others.items():
-        turned = f"R and t of the rig do not map the left camera to the right one, but {how}; correct the rig"
-        yield turned, (cameras, other, left, right)
+    return next((f"{one.say(given)[0]}; {one.advice}" for one in told), "")

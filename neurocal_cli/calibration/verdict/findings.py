@@ -1,11 +1,15 @@
-"""The parts of a verdict: findings with a grade, a reason and advice, and the limits for the grades."""
+"""The parts of a verdict: findings with a grade, a reason and advice, causes, and limits for the grades.
+
+A cause is a value with its words, whether it is one of a camera (`rivals`), of the rows of a file
+(`mistakes`), of a rig (`rig.causes`), of matches (`rig.triangulation`) or of a zoom lens (`zoom.judgement`).
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -18,8 +22,11 @@ WORDS = ("good", "usable", "poor")
 """By grade."""
 
 _Its = TypeVar("_Its")  # cause
+_About = TypeVar("_About")
 Finding = tuple[int, str, str]
 """Grade (0 good, 1 usable, 2 poor), reason, advice."""
+Said = tuple[str, float]
+"""A reason, and the size that the limit of its cause grades."""
 
 # Repeated by test_rivals.py (slow). Of 399 clean sets, with all lenses, the best of all rivals exceeds it in
 # four, of which the verdict names one: in the others it displaces no pixels, or cannot be told from another.
@@ -51,6 +58,39 @@ class Limit:
     def grade(self, value: float) -> int:
         """0 good, 1 usable, 2 poor; nan counts as good."""
         return int(value > self.good) + int(value > self.poor)
+
+
+POOR = Limit(0.0, 0.0)
+"""Limits of what has no amount."""
+
+
+@frozen_dataclass(eq=False)
+class Cause(Generic[_About]):
+    """What is said of a cause."""
+
+    cause: str  # its name
+    looks: str  # what the data look like that show it
+    advice: str
+    say: Callable[[_About], Said]
+    limit: Limit
+
+    def finding(self, about: _About, others: Iterable[str] = ()) -> Finding:
+        """What it says about the data, and the names of others that are hardly less probable."""
+        reason, size = self.say(about)
+        return self.limit.grade(size), reason + or_else(others), self.advice
+
+
+@frozen_dataclass(eq=False)
+class Mistake(Cause[_About]):
+    """A mistake in the data, without unknowns: with the opposite change they would fit."""
+
+    mended: Callable[[_About], _About | None]  # None if the data cannot have it
+    pixel: float = 1.0  # of the data as given, in the mended ones
+
+
+def said(text: str) -> Callable[[object], Said]:
+    """Words of a cause without an amount."""
+    return lambda about: (text, 1.0)
 
 
 # Rms over the image's diagonal: 0.16 px and 4 px of 640 x 480. Boards that are held by hand or stand on an

@@ -19,11 +19,18 @@ from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.point_errors import rms
 from neurocal_cli.calibration.verdict.effects import BENDS
-from neurocal_cli.calibration.verdict.findings import LEVEL, Limit, log_odds, pixel_spread
-from neurocal_cli.calibration.verdict.rival import Cause, Said, causes_among
+from neurocal_cli.calibration.verdict.findings import (
+    LEVEL,
+    POOR,
+    Mistake,
+    Said,
+    log_odds,
+    pixel_spread,
+    said,
+)
+from neurocal_cli.calibration.verdict.rival import causes_among
 from neurocal_cli.calibration.verdict.rivals import SHAPES
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.errors import NeurocalError
@@ -44,14 +51,6 @@ _BETTER = 5.0  # times smaller than the error with the rows as given
 
 Mended = Callable[[Correspondences], Correspondences | None]
 """The points without the mistake; None if they cannot have it."""
-
-
-@frozen_dataclass(eq=False)
-class Mistake(Cause[Correspondences]):
-    """A mistake in the rows of a view, or of all views."""
-
-    mended: Mended
-    pixel: float = 1.0  # of the image as given, in the mended one
 
 
 def _scaled(*by: float) -> Mended:
@@ -117,34 +116,29 @@ def _says_exchanged(points: Correspondences) -> Said:
     )
 
 
-def _says(text: str) -> Callable[[Correspondences], Said]:
-    return lambda points: (text, 1.0)
-
-
-_POOR = Limit(0.0, 0.0)
 _LOOKS = "with the opposite change the points fit the camera of the other views"
 _MAPS = "with the opposite change a homography maps the target to the pixels of each view"
 _AS_STORED = "give all images as they were stored"
-MISTAKES = (
+MISTAKES: tuple[Mistake[Correspondences], ...] = (
     Mistake(
-        "u and v exchanged", _LOOKS, "name the columns in their order", _says("u and v are exchanged"), _POOR,
-        lambda points: replace(points, pixels=points.pixels[:, ::-1]),
+        "u and v exchanged", _LOOKS, "name the columns in their order", said("u and v are exchanged"),
+        POOR, lambda points: replace(points, pixels=points.pixels[:, ::-1]),
     ),
     Mistake(
         "an image turned by 180 degrees", _LOOKS, _AS_STORED,
-        _says("image is turned by 180 degrees against the others"), _POOR, _turned,
+        said("image is turned by 180 degrees against the others"), POOR, _turned,
     ),
     *(
         Mistake(
-            f"an image of {name} the size", _LOOKS, _AS_STORED, _says(f"image is of {name} the size"), _POOR,
-            _scaled(scale), scale,
+            f"an image of {name} the size", _LOOKS, _AS_STORED, said(f"image is of {name} the size"),
+            POOR, _scaled(scale), scale,
         )
         for scale, name in ((2.0, "half"), (0.5, "twice"))
     ),
     *(
         Mistake(
             "an interlaced image", _LOOKS, _AS_STORED,
-            _says(f"{name} is of half resolution, as in interlaced images"), _POOR,
+            said(f"{name} is of half resolution, as in interlaced images"), POOR,
             _scaled(*by), 2.0**0.5,
         )
         for by, name in (((2.0, 1.0), "u"), ((1.0, 2.0), "v"))
@@ -152,13 +146,13 @@ MISTAKES = (
     *(
         Mistake(
             "rows shifted by one", f"{_LOOKS}, or {_MAPS}", "give each pixel the X,Y,Z of its point",
-            _says("rows are shifted by one against the pixels"), _POOR, _shifted(by),
+            said("rows are shifted by one against the pixels"), POOR, _shifted(by),
         )
         for by in (1, -1)
     ),
     Mistake(
         "rows and columns exchanged", _MAPS, "exchange --cols and --rows, or the numbers in the file",
-        _says_exchanged, _POOR, _exchanged,
+        _says_exchanged, POOR, _exchanged,
     ),
 )  # fmt: skip
 """All mistakes; those with the same name are alternatives of one."""
@@ -200,7 +194,10 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     """Explain why one view, of which these are the points, contradicts the others.
 
     The camera is calibrated from the other views, and `rmse_px` is their rms error [px]. A reason is "its u
-    and v are exchanged", for example; it is `otherwise` if no hypothesis fits.
+    and v are exchanged", for example; it is `otherwise` if no hypothesis fits. One has to leave as little
+    error as the other views have, and to beat a bent target by the `LEVEL` of all causes: seen from afar, a
+    turned image or one of another size looks nearly like the same target in another pose, and a bend of the
+    board takes in the rest.
     """
     if not arrange(points).nearly_flat.all() or len(points) < 6:
         return otherwise

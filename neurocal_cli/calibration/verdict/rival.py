@@ -18,7 +18,7 @@ import numpy as np
 from neurocal_cli.adjustment.cross_validation import least_by_precision, quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.calibration.verdict.findings import Limit, in_sequence
+from neurocal_cli.calibration.verdict.findings import Cause, Said, in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -34,10 +34,7 @@ Steps = Callable[[Linearised], Array]
 Pattern = tuple[str, Array, float]
 """Name, weights (P, V) of the views at P places, and the number of choices among patterns of its kind."""
 Patterns = Callable[[Linearised, Array, Array], Iterator[Pattern]]
-Said = tuple[str, float]
-"""A reason, and the size that the rival's limit grades."""
 Its = TypeVar("Its")  # rival
-About = TypeVar("About")
 
 
 @frozen_dataclass(eq=False)
@@ -109,17 +106,6 @@ class Told:
 
 
 Say = Callable[[Told], Said]
-
-
-@frozen_dataclass(eq=False)
-class Cause(Generic[About]):
-    """What is said of a cause."""
-
-    cause: str  # its name
-    looks: str  # what the data look like that show it
-    advice: str
-    say: Callable[[About], Said]
-    limit: Limit
 
 
 @frozen_dataclass(eq=False)

@@ -9,8 +9,14 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
-from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
-from neurocal_cli.calibration.verdict.rival import Said, Say, Told
+from neurocal_cli.calibration.verdict.findings import (
+    STRETCHED_PRINT,
+    WRONG_PRINT,
+    Said,
+    in_sequence,
+    name_some,
+)
+from neurocal_cli.calibration.verdict.rival import Say, Told
 from neurocal_cli.camera.geometry import Array
 
 NEAR = 0.02

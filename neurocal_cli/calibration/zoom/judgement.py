@@ -9,7 +9,7 @@ cameras has no points; there a camera that contradicts the others and the centre
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -18,8 +18,10 @@ from neurocal_cli.calibration.verdict.findings import (
     ELSEWHERE,
     ERROR,
     SHARE,
+    Cause,
     Finding,
     Limit,
+    Said,
     likeliest,
     log_odds,
     verdict_of,
@@ -27,6 +29,7 @@ from neurocal_cli.calibration.verdict.findings import (
 from neurocal_cli.calibration.zoom.parameter_networks import local_to_outputs, odd_camera
 from neurocal_cli.calibration.zoom.settings import describe, middles
 from neurocal_cli.calibration.zoom.zoom_lens import Prediction, ZoomLens
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 
 # Repeated by test_the_verdict_on_a_lens. The networks of smooth lenses stay within 1.04 of the noise floor
 # even between settings (slow tests in test_zoom_lens.py). The noise floor is 0.99 to 1.02 of that with a pose
@@ -78,7 +81,7 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
             "check the names and the points of these settings",
         )
     yield from _large_error(lens, lens.rmse_px)
-    causes = list(_causes(lens))
+    causes = [one.finding(lens) for one in likeliest((one.odds(lens), one) for one in CAUSES)]
     yield from causes
     floor = lens.noise_floor_px
     if not any(grade for grade, *_ in causes):
@@ -90,39 +93,72 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
         )
 
 
-def _causes(lens: ZoomLens) -> Iterator[Finding]:
-    """The likeliest cause of an error above the noise floor, and those that are hardly less probable."""
-    floor, error = max(lens.noise_floor_px, _EXACT), max(lens.rmse_px, _EXACT)
-    free = max(lens.free_pose_px, _EXACT)  # nan if it is unknown
-    n, S, L, worst = 2 * int(lens.counts.sum()), len(lens.settings), len(lens.names), int(lens.rmse.argmax())
-    largest = float(lens.rmse[worst])
-    without = error**2 - max(largest**2 - floor**2, 0.0) * lens.counts[worst] * 2 / n
-    found: tuple[tuple[float, float, str, str], ...] = (
-        (
-            log_odds(error**2, without, n, L, S),
-            largest / floor,
-            f"the error at {describe(lens.controls, lens.settings[worst])} is {largest:.3g} px, that of the "
-            f"other settings {float(np.median(lens.rmse)):.3g} px",
-            "check the name and the points of this setting",
-        ),
-        (
-            log_odds(error**2, floor**2, n, S * L),
-            error / floor,
-            f"the error is {error / floor:.2f} times the noise floor, which is {floor:.3g} px "
-            "(the error of a separate camera for each setting)",
-            "check that the lens returns to the same position, that camera and target stay where they are "
-            "(or give --camera moving), and that the settings have their true names",
-        ),
-        (
-            log_odds(error**2, free**2, n, S * (L + 5)),  # besides t_z, a pose has five unknowns
-            error / free,
-            f"the noise floor is {floor:.3g} px with one pose for all settings, {free:.3g} px with a pose "
-            "for each: the camera or the target moved between the settings",
-            "give --camera moving, or keep both where they are",
-        ),
+@frozen_dataclass(eq=False)
+class ZoomCause(Cause[ZoomLens]):
+    """A cause of an error above the noise floor, by what it leaves of that."""
+
+    left: Callable[[ZoomLens], float]  # rms error with it [px]; nan if that is unknown
+    unknowns: Callable[[int, int], int]  # of S settings with L parameters each
+    of_one: bool = False  # any one of the settings, or all
+
+    def odds(self, lens: ZoomLens) -> float:
+        """Log odds over nothing."""
+        S, L = len(lens.settings), len(lens.names)
+        before, after = (max(px, _EXACT) ** 2 for px in (lens.rmse_px, self.left(lens)))
+        choices = S if self.of_one else 1
+        return log_odds(before, after, 2 * int(lens.counts.sum()), self.unknowns(S, L), choices)
+
+
+def _without_worst(lens: ZoomLens) -> float:
+    squares = lens.rmse**2
+    squares[squares.argmax()] = min(squares.max(), lens.noise_floor_px**2)
+    return float(np.sqrt((squares * lens.counts).sum() / lens.counts.sum()))
+
+
+def _is_wrong_setting(lens: ZoomLens) -> Said:
+    worst = int(lens.rmse.argmax())
+    where, largest = describe(lens.controls, lens.settings[worst]), float(lens.rmse[worst])
+    others = float(np.median(lens.rmse))
+    text = f"the error at {where} is {largest:.3g} px, that of the other settings {others:.3g} px"
+    return text, largest / max(lens.noise_floor_px, _EXACT)
+
+
+def _contradict(lens: ZoomLens) -> Said:
+    floor = lens.noise_floor_px
+    times = max(lens.rmse_px, _EXACT) / max(floor, _EXACT)
+    text = f"the error is {times:.2f} times the noise floor, which is {floor:.3g} px"
+    return f"{text} (the error of a separate camera for each setting)", times
+
+
+def _has_moved(lens: ZoomLens) -> Said:
+    floor, free = lens.noise_floor_px, lens.free_pose_px
+    return (
+        f"the noise floor is {floor:.3g} px with one pose for all settings, {free:.3g} px with a pose for "
+        "each: the camera or the target moved between the settings",
+        max(lens.rmse_px, _EXACT) / max(free, _EXACT),
     )
-    for times, reason, advice in likeliest((one[0], one[1:]) for one in found):
-        yield ELSEWHERE.grade(times), reason, advice
+
+
+CAUSES = (
+    ZoomCause(
+        "a wrong setting", "one setting has most of the error",
+        "check the name and the points of this setting",
+        _is_wrong_setting, ELSEWHERE, _without_worst, lambda S, L: L, of_one=True,
+    ),
+    ZoomCause(
+        "settings that contradict each other", "with a camera for each setting, only noise is left",
+        "check that the lens returns to the same position, that camera and target stay where they are "
+        "(or give --camera moving), and that the settings have their true names",
+        _contradict, ELSEWHERE, lambda lens: lens.noise_floor_px, lambda S, L: S * L,
+    ),
+    ZoomCause(
+        "a camera that moves between the settings", "with a camera and a pose for each, less is left",
+        "give --camera moving, or keep both where they are",
+        _has_moved, ELSEWHERE, lambda lens: lens.free_pose_px,
+        lambda S, L: S * (L + 5),  # besides t_z, a pose has five unknowns
+    ),
+)  # fmt: skip
+"""Causes of an error above the noise floor; the likeliest are told, in this order."""
 
 
 def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Finding]:
