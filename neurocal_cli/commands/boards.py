@@ -122,8 +122,8 @@ class BoardOptions:
 
 
 _BOARD_FILE = (
-    "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
-    "chessboard:COLSxROWS:SQUARE, aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], "
+    "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, the name of calib.io's PDF, or a "
+    "board in short: chessboard:COLSxROWS:SQUARE, aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], "
     "charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], arucogrid:COLSxROWS:MARKER:SPACING:DICTIONARY, "
     "circles:COLSxROWS:DISTANCE[:DIAMETER] (asymmetric_circles alike). COLS and ROWS count squares, tags or "
     "circles; of a chessboard, inner vertices."

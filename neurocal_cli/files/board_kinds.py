@@ -1,10 +1,12 @@
 """The kinds of boards: their keys in files, and their short forms on the command line.
 
-A board in short is ``kind:COLSxROWS:LENGTH...``, with lengths that are called as the keys.
+A board in short is ``kind:COLSxROWS:LENGTH...``, with lengths that are called as the keys. calib.io's
+generator of patterns says as much in the name of a file, ``calib.io_KIND_SHEET_ROWSxCOLS_LENGTH...``, in mm.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from typing import Any
 
@@ -65,6 +67,7 @@ _SHORT = {
     "circles": "distance diameter?",
     "asymmetric_circles": "distance diameter?",
 }
+_CALIB_IO = re.compile(r"calib\.io_(checker|charuco|circles)_[^_]+_(\d+)x(\d+)_(.+)\.\w+", re.IGNORECASE)
 
 
 def short_form(kind: str) -> str:
@@ -145,11 +148,24 @@ def read_plane(field: Field, kind: str, **place: Any) -> Plane:
     return plane_of(kind, **values, **place)
 
 
+def _of_calib_io(kind: str, rows: str, cols: str, rest: str) -> str:
+    """The short form of what the name of a file says; a dictionary without its size is the largest."""
+    lengths, _, dictionary = rest.upper().partition("_DICT_")
+    words = lengths.split("_")[: 1 if kind == "checker" else 2]
+    if kind.lower() == "checker":
+        return f"chessboard:{int(cols) - 1}x{int(rows) - 1}:{words[0]}"
+    if dictionary:
+        words.append(f"{dictionary}_1000" if re.fullmatch(r"\dX\d", dictionary) else dictionary)
+    return ":".join([kind.lower(), f"{cols}x{rows}", *words])
+
+
 def short_board(form: str, unit: str = "mm") -> Board | None:
     """The board of a short form such as ``charuco:8x8:25.4:19.05``; None if the text is none.
 
-    Raises UsageError if it begins like one and is not.
+    The name of a file of calib.io is one, too. Raises UsageError if it begins like one and is not.
     """
+    if named := _CALIB_IO.fullmatch(os.path.basename(form)):
+        return short_board(_of_calib_io(*named.groups()))
     kind, colon, rest = form.partition(":")
     if kind not in KINDS or not colon:
         return None

@@ -226,9 +226,19 @@ FORMATS = (
         inner=True,
     ),
     BoardFormat("caliscope", "`charuco.toml`", "aruco_scale", {"": ("charuco", _SHEET)}, "cm", "board_type"),
+    # It does not tell a ChArUco board from a chessboard.
+    BoardFormat(
+        "PhotonVision",
+        "its calibration",
+        "calobjectSize",
+        {"": ("chessboard", "cols=calobjectSize/width, rows=calobjectSize/height, square=calobjectSpacing")},
+        "m",
+        "board_type",
+        inner=True,
+    ),
     BoardFormat(
         "PhotonVision or OpenCV's classes",
-        "its settings, and what calib.io and scripts write with the names of OpenCV's arguments",
+        "its settings, and what scripts write with the names of OpenCV's arguments",
         f"{_MARKER} board_type",
         {
             "*charuco* 1": ("charuco", f"{_SQUARES}, marker={_MARKER}, {_CHARUCO}"),
@@ -281,9 +291,12 @@ def nearest_board(root: Field) -> str:
 
 
 def _first(root: Field, names: str) -> tuple[Field | None, str]:
-    """The first value that has one of the names, and the unit that the name tells."""
+    """The first value under one of the names, some of them ``key/key``, and the unit that the name tells."""
     for name, _, unit in (word.partition(":") for word in names.split()):
-        if (field := root.called(name)) is not None:
+        field: Field | None = root
+        for key in name.split("/"):
+            field = None if field is None else field.called(key)
+        if field is not None:
             return field, unit
     return None, ""
 

@@ -134,6 +134,21 @@ def test_short_forms(form: str, plane: Plane) -> None:
     assert short_board(form, "cm") == Board((plane,), "cm")
 
 
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("checker_200x150_8x11_15.pdf", "chessboard:10x7:15"),
+        ("checker_A4_8x11_20.pdf", "chessboard:10x7:20"),
+        ("charuco_200x150_8x11_15_11_DICT_4X4.pdf", "charuco:11x8:15:11:DICT_4X4_1000"),
+        ("CHARUCO_300x220_5x7_40_31_DICT_ARUCO_ORIGINAL.svg", "charuco:7x5:40:31:DICT_ARUCO_ORIGINAL"),
+        ("circles_200x150_8x10_18_8.33.pdf", "circles:10x8:18:8.33"),
+        ("circles_200x150_8x11_12_5_01.bmp", "circles:11x8:12:5"),
+    ],
+)
+def test_the_names_of_calib_ios_files_tell_rows_columns_and_mm(name: str, form: str) -> None:
+    assert short_board(f"downloads/calib.io_{name}", "cm") == short_board(form, "mm")
+
+
 @pytest.mark.parametrize("form", ["board.yaml", "charuco", "C:/boards/charuco.yaml"])
 def test_other_texts_are_no_short_forms(form: str) -> None:
     assert short_board(form) is None
@@ -150,6 +165,7 @@ def test_other_texts_are_no_short_forms(form: str) -> None:
         ("circles:7x6:twenty", "give circles:"),
         ("circles:7x6:20:30", "diameter must be below the distance"),
         ("aprilgrid:6x6:40:-1", "spacing must be a positive ratio"),
+        ("calib.io_charuco_215.9x279.4_7x5_35_DICT_4X4.pdf", "5x7:35:4X4_1000: give charuco:COLSxROWS"),
     ],
 )
 def test_wrong_short_forms_say_what_is_right(form: str, match: str) -> None:

@@ -92,6 +92,13 @@ def test_photonvision_counts_squares_in_inches(tmp_path: Path) -> None:
     assert read_board(path) == Board((Plane("", 7, 5, 1.0),), "inch")
 
 
+def test_the_calibration_of_photonvision_counts_inner_vertices_in_metres(tmp_path: Path) -> None:
+    path = tmp_path / "photon_calibration_1280x720.json"
+    size = {"width": 7.0, "height": 5.0}
+    path.write_text(json.dumps({"observations": [], "calobjectSize": size, "calobjectSpacing": 0.0254}))
+    assert read_board(path) == Board((Plane("", 7, 5, 0.0254),), "m")
+
+
 @pytest.mark.parametrize(
     "text",
     [
