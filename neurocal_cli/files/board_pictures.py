@@ -1,7 +1,8 @@
 """Write a sheet with a board as SVG, PDF or PNG, at its exact size.
 
-SVG and PDF contain the squares as polygons, in millimetres and points. PNG contains their exact coverage of
-each pixel, and the resolution.
+SVG and PDF contain the squares as polygons, in millimetres and points. All are one path: where the black
+cells of a marker are drawn one by one, many printers and viewers leave a grey seam between them. PNG contains
+their exact coverage of each pixel, and the resolution.
 """
 
 from __future__ import annotations
@@ -31,9 +32,8 @@ _CIRCLE = np.concatenate(
 
 def board_svg(sheet: Sheet) -> str:
     """Write the sheet as SVG in millimetres."""
-    squares = "\n".join(
-        f'<path d="M{" L".join(f"{x:.6f} {y:.6f}" for x, y in square)} Z"/>' for square in sheet.squares
-    )
+    path = "\n".join(f"M{' L'.join(f'{x:.6f} {y:.6f}' for x, y in square)} Z" for square in sheet.squares)
+    squares = f'<path d="{path}"/>' if path else ""
     squares += "".join(f'\n<circle cx="{x:.6f}" cy="{y:.6f}" r="{r:.6f}"/>' for x, y, r in sheet.discs)
     lines = "\n".join(
         f'<line x1="{line.start[0]:.6f}" y1="{line.start[1]:.6f}" x2="{line.end[0]:.6f}" '
@@ -67,7 +67,8 @@ def board_pdf(sheet: Sheet) -> bytes:
 
     content = ["0 g 0 G"]
     for square in sheet.squares:
-        content.append(f"{place(square[0])} m {' '.join(f'{place(p)} l' for p in square[1:])} h f")
+        content.append(f"{place(square[0])} m {' '.join(f'{place(p)} l' for p in square[1:])} h")
+    content += ["f"] if len(sheet.squares) else []
     for x, y, radius in sheet.discs:
         content.append(_round([place(p) for p in (np.array([x, y]) + radius * _CIRCLE)]))
     for line in sheet.lines:
