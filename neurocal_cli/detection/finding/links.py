@@ -67,53 +67,48 @@ def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links 
     count = len(saddles)
     if count < _FEWEST:
         return None
-    place = saddles.points.astype(np.float32)
-    du, dv = (place[None, :, k] - place[:, None, k] for k in (0, 1))
-    distance = du * du + dv * dv
-    np.fill_diagonal(distance, np.inf)
-    port = _port_towards(du, dv, saddles.ports)
-    fit = (port >= 0) & (port.T >= 0) & ((port ^ port.T) & 1 == 1)
-    to = np.full((count, 4), -1, dtype=np.intp)
-    entry = np.full((count, 4), -1, dtype=np.intp)
-    rows = np.arange(count)
-    for p in range(4):
-        length = np.where(fit & (port == p), distance, np.inf)
-        best = length.argmin(axis=1)
-        found = np.isfinite(length[rows, best])
-        to[found, p] = best[found]
-        entry[found, p] = port[best, rows][found]
-    mutual = (to >= 0) & (to[to, entry] == rows[:, None])
-    to[~mutual], entry[~mutual] = -1, -1
-    unseen = ~_edges_visible(level, saddles, to, entry)
-    to[unseen], entry[unseen] = -1, -1
-    return Links(saddles, to, entry)
+    reachable = _lead_to(saddles, 0) & _lead_to(saddles, 1).T
+    np.fill_diagonal(reachable, False)
+    # Each edge is known from its even end. Ports of all saddles are numbered in turn.
+    first, second = np.nonzero(reachable)
+    step = saddles.points[second] - saddles.points[first]
+    even, odd = (
+        4 * saddle + line + 2 * ((_direction(saddles.ports[saddle, line]) * away).sum(axis=1) < 0)
+        for saddle, line, away in ((first, 0, step), (second, 1, -step))
+    )
+    length, shortest = np.hypot(*step.T), np.full(4 * count, np.inf)
+    for end in (even, odd):
+        np.minimum.at(shortest, end, length)
+    linked = np.flatnonzero((length == shortest[even]) & (length == shortest[odd]))
+    linked = linked[_edges_visible(level, saddles, first[linked], second[linked])]
+    entered = np.full(4 * count, -4, dtype=np.intp)
+    entered[even[linked]], entered[odd[linked]] = odd[linked], even[linked]
+    to = entered.reshape(-1, 4) // 4
+    return Links(saddles, to, np.where(to < 0, -1, entered.reshape(-1, 4) % 4))
 
 
-def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array) -> NDArray[np.int8]:
-    """(N, N) port of each saddle (row) that points to each other saddle (column), or -1."""
-    port = np.full(du.shape, -1, dtype=np.int8)
-    opening = ports[:, 1] - ports[:, 0]
+def _lead_to(saddles: Saddles, line: int) -> NDArray[np.bool_]:
+    """(N, N) whether the ports `line` and `line` + 2 of each saddle point along a line to each other one."""
+    opening = saddles.ports[:, 1] - saddles.ports[:, 0]
     widest = _SHARE * np.minimum(opening, np.pi - opening)
     usual, most = (np.tan(x).astype(np.float32)[:, None] for x in (np.minimum(_WIDEST, widest), widest))
-    for line in range(2):
-        c, s = (f(ports[:, line]).astype(np.float32)[:, None] for f in (np.cos, np.sin))
-        along, across = c * du + s * dv, np.abs(c * dv - s * du)
-        reach = np.abs(along)
-        # Directions are only accurate to a pixel or two at the end of a short edge.
-        close = across < np.maximum(usual * reach, np.minimum(most * reach, _ASIDE))
-        port[close & (along > 0)] = line
-        port[close & (along < 0)] = line + 2
-    return port
+    place = (saddles.points - saddles.points.mean(axis=0)).astype(np.float32)
+    along, across = (
+        np.abs(n @ place.T - (n * place).sum(axis=1)[:, None])
+        for n in (_direction(saddles.ports[:, line] + turn).astype(np.float32) for turn in (0, np.pi / 2))
+    )
+    # Directions are only accurate to a pixel or two at the end of a short edge.
+    return np.asarray(across < np.maximum(usual * along, np.minimum(most * along, np.float32(_ASIDE))))
 
 
-def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDArray[np.bool_]:
-    """(N, 4) mask of links with dark and light on the right sides along their length."""
-    seen = np.zeros(to.shape, dtype=bool)
-    first, p = np.nonzero(to >= 0)
-    if not len(first):
-        return seen
-    start, end = saddles.points[first], saddles.points[to[first, p]]
-    step = end - start
+def _direction(angle: Array) -> Array:
+    """Unit vectors (N, 2) of angles (N,)."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _edges_visible(level: Level, saddles: Saddles, first: Index, second: Index) -> NDArray[np.bool_]:
+    """(E,) mask of edges, from even ports, with dark and light on the right sides along their length."""
+    start, step = saddles.points[first], saddles.points[second] - saddles.points[first]
     length = np.hypot(*step.T)
     normal = np.stack([-step[:, 1], step[:, 0]], axis=-1) / length[:, None]
     reach = np.clip(0.2 * length, 1.0, 2.5)
@@ -121,13 +116,9 @@ def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> N
     middle = start[:, None] + share[:, None] * step[:, None]
     offset = (reach[:, None] * normal)[:, None]
     # The normal is the step turned from u towards v, so at an even port it points to the dark side.
-    sides = interpolate(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
-    rise = (sides[:, 0] - sides[:, 1]) * np.where(p % 2 == 0, 1, -1)[:, None]
-    contrast = np.minimum(saddles.contrast[first], saddles.contrast[to[first, p]])
-    seen[first, p] = rise.min(axis=1) > 0.15 * contrast
-    back = np.zeros_like(seen)
-    back[first, p] = seen[to[first, p], entry[first, p]]
-    return seen & back
+    light, dark = (interpolate(level.smooth, middle + side * offset) for side in (-1, 1))
+    contrast = np.minimum(saddles.contrast[first], saddles.contrast[second])
+    return np.asarray((light - dark).min(axis=1) > 0.15 * contrast)
 
 
 def find_seeds(links: Links) -> Index:

@@ -199,8 +199,7 @@ def _steepest_pixels(level: Level, covered: NDArray[np.uint8] | None) -> Array:
         steepness = uv[band] * uv[band]
         steepness -= uu[band] * vv[band]
         largest = cv2.dilate(steepness, np.ones((2 * _AROUND + 1,) * 2, np.uint8))
-        np.maximum(largest, least, out=largest)
-        peak = np.flatnonzero(steepness >= largest)
+        peak = np.flatnonzero((steepness >= largest) & (steepness >= least))
         v, u = np.divmod(peak, width)
         inner = (v >= _AROUND) & (v < _AROUND + bottom - top) & (u >= _BORDER) & (u < width - _BORDER)
         v, u = v[inner], u[inner]
