@@ -19,7 +19,7 @@ def table() -> str:
     from neurocal_cli.calibration.rig import causes, triangulation
     from neurocal_cli.calibration.verdict import effects
     from neurocal_cli.calibration.verdict.mistakes import MISTAKES
-    from neurocal_cli.calibration.verdict.rivals import RIVALS
+    from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, RIVALS
     from neurocal_cli.calibration.zoom import judgement
 
     shared = {
@@ -29,7 +29,7 @@ def table() -> str:
         effects.grouped: "a group of views",
         None: "no views: each has its own",
     }
-    rows = [(one, shared[one.patterns]) for one in RIVALS]
+    rows = [(one, shared[one.patterns]) for one in (*RIVALS, ANOTHER_LENS)]
     rows += [(one, "one view, or all") for one in MISTAKES]
     rows += [(one, f"{'all cameras' if one.of_all else 'a camera'} of a rig") for one in causes.CAUSES]
     rows.append((causes.MIXED_UNITS, "all cameras of a rig"))

@@ -29,7 +29,7 @@ from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import causes_among
-from neurocal_cli.calibration.verdict.rivals import NEIGHBOURS
+from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, NEIGHBOURS, ODD_VIEW
 from neurocal_cli.camera.geometry import Array, median
 
 _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
@@ -89,7 +89,7 @@ def odd_view(solution: Solution) -> str | None:
     """The view that contradicts the others most, or None if no view is odd.
 
     Something that differs between views has to be among the causes of the contest, which does not tell how
-    much a view spoils. The contradiction of a view is the drop in squared error if it had its own camera, per
+    much a view spoils; a lens of another kind must not be more probable than one odd view. The contradiction of a view is the drop in squared error if it had its own camera, per
     condition that the common camera imposes on it. On real boards, which are not quite flat, every view has
     some tens of that of noise; an odd view has to stand out from the others.
     """
@@ -120,7 +120,10 @@ def odd_view(solution: Solution) -> str | None:
         return None
     held = contest_of(problem, adjusted, solution.repeated.worth)
     differs = held is not None and any(one.pattern != "all" for one in held.causes)
-    return views.names[view] if differs else None
+    if held is None or not differs:
+        return None
+    rivals = causes_among((ODD_VIEW, ANOTHER_LENS), problem, adjusted.state, held.n)
+    return views.names[view] if rivals and rivals[0].rival is ODD_VIEW else None
 
 
 def _contradictions(normal: Array, free: NDArray[np.bool_], own: Array) -> Array:

@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.board.prior import STRETCH
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.effects import common, field
+from neurocal_cli.calibration.verdict.effects import another_lens, common, field
 from neurocal_cli.calibration.verdict.findings import (
     DISPLACED,
     ERROR,
@@ -30,7 +30,14 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
 from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
-from neurocal_cli.calibration.verdict.rivals import EFFECTS, NEIGHBOURS, RICHER_LENSES, RIVALS, SHAPES
+from neurocal_cli.calibration.verdict.rivals import (
+    ANOTHER_LENS,
+    EFFECTS,
+    NEIGHBOURS,
+    RICHER_LENSES,
+    RIVALS,
+    SHAPES,
+)
 from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -109,7 +116,9 @@ def contest(
         held = _held(at_minimum(), worth, RIVALS)
         if all(one.pattern == "all" for one in held.causes):
             return held
-        lin = at_minimum(field)
+        lin = at_minimum(field, another_lens)
+        if estimates(lin, held.n, (ANOTHER_LENS,), held.causes[0].evidence):
+            held = _held(lin, worth, (*RIVALS, ANOTHER_LENS))
         smooth, beside = estimates(lin, held.n, (NEIGHBOURS,)), lin
         for one in held.causes:
             beside = including(beside, one)
@@ -117,7 +126,7 @@ def contest(
         found = [*held.causes, *estimates(beside, held.n, (NEIGHBOURS,), 0.0)[:1]]
         if not smooth or sum(max(one.evidence, 0.0) for one in found) > smooth[0].evidence + LEVEL:
             return held
-        of_all = tuple(rival for rival in RIVALS if rival.patterns is common)
+        of_all = tuple(rival for rival in (*RIVALS, ANOTHER_LENS) if rival.patterns is common)
         return _held(including(lin, smooth[0]), worth, of_all)
     except np.linalg.LinAlgError:
         return None

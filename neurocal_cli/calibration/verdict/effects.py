@@ -24,6 +24,7 @@ from neurocal_cli.camera.geometry import Array
 BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 """Powers of x and y of a smooth bend; lower ones describe the plane."""
 _GLASS = 1.5  # its refractive index
+_RADIAL = (2, 3, 4)  # powers of r^2 of radial displacements, beyond those among `BENDS`
 
 
 def bends(seen: Seen) -> Array | None:
@@ -53,8 +54,21 @@ def deformed(seen: Seen) -> Array | None:
 def field(seen: Seen) -> Array:
     """A smooth field of displacements, by powers of the place on the board; of that in the image if none."""
     x, y = np.moveaxis(seen.pixels, 1, 0) if seen.places is None else seen.places
-    powers = np.stack([x**i * y**j for i, j in ((1, 0), (0, 1), *BENDS)], axis=1)[:, :, None]
-    return np.concatenate([seen.by_entries[:, 3 + a, None] * powers for a in (0, 1)], axis=1)
+    return _by_powers(seen, [x**i * y**j for i, j in ((1, 0), (0, 1), *BENDS)])
+
+
+def another_lens(seen: Seen) -> Array:
+    """A smooth field of displacements in the image; those along the radius by higher powers as well."""
+    x, y = np.moveaxis(seen.pixels, 1, 0)
+    outwards = np.einsum("taip,tap->tip", seen.by_entries[:, 3:5], seen.pixels)[:, None]
+    radial = [outwards * ((x**2 + y**2) ** k)[:, None, None] for k in _RADIAL]
+    return np.concatenate([_by_powers(seen, [x**i * y**j for i, j in BENDS]), *radial], axis=1)
+
+
+def _by_powers(seen: Seen, powers: list[Array]) -> Array:
+    """Displacements along u and along v that are powers (T, n) of a place."""
+    columns = np.stack(powers, axis=1)[:, :, None]
+    return np.concatenate([seen.by_entries[:, 3 + a, None] * columns for a in (0, 1)], axis=1)
 
 
 def glass(seen: Seen) -> Array | None:

@@ -233,6 +233,19 @@ RIVALS: tuple[Rival, ...] = (
 """All rivals; those with the same name are alternatives of one cause."""
 NEIGHBOURS = replace(RIVALS[-1], cause="noise that neighbours share", steps=None, effect=effects.field)
 """Causes that differ between views are not told if this is as probable as all causes together."""
+ANOTHER_LENS = replace(
+    RICHER_LENSES[0],
+    say=words.plain(
+        "the distortion model is too simple: a smooth field that all views share displaces the points by {px} "
+        "px rms"
+    ),
+    advice="give --distortion auto or rich",
+    steps=None,
+    effect=effects.another_lens,
+)
+"""They are not told if this one is more probable, nor is a view left out."""
+ODD_VIEW = next(rival for rival in RIVALS if rival.patterns is effects.one_view and rival.steps)
+"""One view with another camera."""
 SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is effects.common)
 """Those by which the target has another shape in all views."""
 EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
