@@ -89,9 +89,10 @@ def odd_view(solution: Solution) -> str | None:
     """The view that contradicts the others most, or None if no view is odd.
 
     Something that differs between views has to be among the causes of the contest, which does not tell how
-    much a view spoils; a lens of another kind must not be more probable than one odd view. The contradiction of a view is the drop in squared error if it had its own camera, per
-    condition that the common camera imposes on it. On real boards, which are not quite flat, every view has
-    some tens of that of noise; an odd view has to stand out from the others.
+    much a view spoils, and one odd view has to be more probable than a lens of another kind. The
+    contradiction of a view is the drop in squared error if it had its own camera, per condition that the
+    common camera imposes on it. On real boards, which are not quite flat, every view has some tens of that of
+    noise; an odd view has to stand out from the others.
     """
     problem, adjusted = solution.problem, solution.adjusted
     views, free = problem.views, problem.free_of_prior
@@ -119,11 +120,10 @@ def odd_view(solution: Solution) -> str | None:
     if not contradiction[view] > OUTLIER * max(float(median(left)), 1.0):
         return None
     held = contest_of(problem, adjusted, solution.repeated.worth)
-    differs = held is not None and any(one.pattern != "all" for one in held.causes)
-    if held is None or not differs:
+    if held is None or all(one.pattern == "all" for one in held.causes):
         return None
-    rivals = causes_among((ODD_VIEW, ANOTHER_LENS), problem, adjusted.state, held.n)
-    return views.names[view] if rivals and rivals[0].rival is ODD_VIEW else None
+    likelier = causes_among((ODD_VIEW, ANOTHER_LENS), problem, adjusted.state, held.n)
+    return views.names[view] if likelier and likelier[0].rival is ODD_VIEW else None
 
 
 def _contradictions(normal: Array, free: NDArray[np.bool_], own: Array) -> Array:

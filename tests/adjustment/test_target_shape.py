@@ -276,12 +276,15 @@ def test_what_is_no_shape_is_not_taken_for_one() -> None:
 
 
 @pytest.mark.slow
-def test_a_wrong_square_is_not_taken_for_a_shape() -> None:
-    points, _ = photographed("flat", 10, 8)
+def test_a_wrong_square_is_measured_and_told() -> None:
+    points, truth = photographed("flat", 10, 8)
     found = calibrate(replace(points, world=points.world * [1.0, 1.06, 1.0]), distortion="k1k2")
-    assert found.target is None
+    assert found.target is not None
+    assert found.target.stretch() == pytest.approx(0.06, abs=0.001)
+    assert np.abs(errors(found, truth.K) / [found.std[name] for name in PARAMETERS]).max() < 4
     assert found.verdict is not None
-    assert found.verdict.word != "good"
+    assert found.verdict.word == "poor"
+    assert "the target is 6 % longer along X, compared with Y" in found.verdict.reasons[0]
 
 
 # A bent board that was found in its place was good, with the focal length five standard deviations off.

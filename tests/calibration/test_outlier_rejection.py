@@ -67,17 +67,22 @@ def test_a_wrong_view_of_ten_changes_nothing_in_many_scenes(distortion: str) -> 
         a_wrong_view_changes_nothing(seed, MISMATCHES[seed % len(MISMATCHES)], distortion)
 
 
-def test_no_view_is_left_out_unless_a_cause_differs_between_views() -> None:
-    points, _ = campaign_scene(29)  # one of its six clean views has 34 times the contradiction of the others
+# In scene 29, one of six clean views has 34 times the contradiction of the others. In 9370 the lens that is
+# selected at first is too simple.
+@pytest.mark.parametrize("seed", [29, 9370])
+def test_no_view_is_left_out_unless_a_cause_differs_between_views(seed: int) -> None:
+    points, _ = campaign_scene(seed)
     assert not calibrate(points).rejected.views
 
 
 @pytest.mark.slow
 def test_no_view_is_left_out_if_all_lack_the_same_coefficients() -> None:
     points, _ = campaign_scene(204)
-    named = calibrate(points, distortion="eucm")
-    assert not named.rejected.views
-    assert any("distortion model is too simple" in reason for reason in named.verdict.reasons)
+    for model in ("eucm", "k1k2p1p2"):
+        named = calibrate(points, distortion=model)
+        assert not named.rejected.views
+        assert "distortion model is too simple" in named.verdict.reasons[0]
+    assert not calibrate(points, distortion="plumb-line").rejected.views
 
 
 @pytest.mark.parametrize("flat", slow_but((True,), [True, False]))

@@ -236,8 +236,8 @@ NEIGHBOURS = replace(RIVALS[-1], cause="noise that neighbours share", steps=None
 ANOTHER_LENS = replace(
     RICHER_LENSES[0],
     say=words.plain(
-        "the distortion model is too simple: a smooth field that all views share displaces the points by {px} "
-        "px rms"
+        "the distortion model is too simple: a smooth field that all views share displaces the points by "
+        "{px} px rms"
     ),
     advice="give --distortion auto or rich",
     steps=None,
