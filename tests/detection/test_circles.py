@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import cv2
@@ -14,7 +15,7 @@ from support.pictures import Illumination, Rendered
 from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import Blobs, place_circles
+from neurocal_cli.detection.circles.lattice import Blobs, largest_lattice, place_circles
 from neurocal_cli.detection.circles.measuring import _missed
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.placement import NoBoardError
@@ -228,3 +229,16 @@ def test_errors_over_the_bound(form: str, square: float, condition: dict[str, fl
     rms = np.sqrt((np.concatenate(every) ** 2).mean())
     assert rms < 1.25 / light * np.mean(bounds)
     assert 0.8 < np.concatenate(normal).mean() < 1.3
+
+
+def test_thousands_of_marks_do_not_fill_the_memory() -> None:
+    """Pictures of grass and skin have as many; a table of their distances would take 256 MB."""
+    rng = np.random.default_rng(4)
+    blobs = Blobs(rng.uniform(0, 4000, (4000, 2)), rng.uniform(20, 60, 4000))
+    tracemalloc.start()
+    try:
+        largest_lattice(blobs, 3000)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 20e6

@@ -97,13 +97,18 @@ def _distinct(looks: list[Array]) -> Blobs:
     A window smaller than a disc finds a ring along its edge, with an inner outline as well.
     """
     every = np.concatenate([one[np.lexsort(one.T[::-1])[::-1]] for one in looks])
+    reach = _SAME * np.sqrt(every[:, 0] / np.pi)
+    by_u = np.argsort(every[:, 1])
+    u = every[by_u, 1]
+    first, last = np.searchsorted(u, every[:, 1] - reach), np.searchsorted(u, every[:, 1] + reach)
     kept: list[int] = []
     taken = np.zeros(len(every), dtype=bool)
     for k in range(len(every)):
         if not taken[k]:
             kept.append(k)
-            away = np.hypot(*(every[:, 1:3] - every[k, 1:3]).T)
-            taken |= away < _SAME * np.sqrt(np.minimum(every[:, 0], every[k, 0]) / np.pi)
+            near = by_u[first[k] : last[k]]
+            away = np.hypot(*(every[near, 1:3] - every[k, 1:3]).T)
+            taken[near] |= away < np.minimum(reach[near], reach[k])
     return Blobs(every[kept, 1:3], every[kept, 0])
 
 
@@ -250,8 +255,6 @@ def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
     if len(blobs) < 4:
         return best
     centre = blobs.centre
-    away = np.hypot(*(centre[:, None] - centre[None]).transpose(2, 0, 1))
-    np.fill_diagonal(away, np.inf)
     # Starts far from each other: every n-th blob along the image.
     order = np.lexsort((centre[:, 0], np.round(centre[:, 1] / 50)))
     step = max(1, len(order) // _STARTS)
@@ -259,7 +262,7 @@ def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
     for start in order[::step].tolist():
         if start in tried:
             continue
-        grown = _grown(blobs, away, start)
+        grown = _grown(blobs, start)
         tried.update(grown.values())
         if len(grown) > len(best):
             best = grown
@@ -268,9 +271,9 @@ def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
     return best
 
 
-def _grown(blobs: Blobs, away: Array, start: int) -> dict[tuple[int, int], int]:
+def _grown(blobs: Blobs, start: int) -> dict[tuple[int, int], int]:
     """The lattice around a blob, layer by layer, where those around a place predict a circle of its size."""
-    steps = _steps(blobs, away, start)
+    steps = _steps(blobs, start)
     if steps is None:
         return {}
     centre, size = blobs.centre, blobs.area[start] / abs(float(np.linalg.det(steps)))
@@ -297,10 +300,10 @@ def _grown(blobs: Blobs, away: Array, start: int) -> dict[tuple[int, int], int]:
         at[row[new], col[new]] = near[new]
 
 
-def _steps(blobs: Blobs, away: Array, start: int) -> Array | None:
+def _steps(blobs: Blobs, start: int) -> Array | None:
     """The steps (2, 2) from a blob to two neighbours, of which the opposite ones are there too."""
-    near = np.argsort(away[start])[:12]
-    near = near[np.isfinite(away[start, near])]
+    near = np.argsort(np.hypot(*(blobs.centre - blobs.centre[start]).T))[:13]
+    near = near[near != start][:12]
     ratio = blobs.area[near] / blobs.area[start]
     near = near[(ratio < _ALIKE) & (ratio > 1 / _ALIKE)]
     vectors = blobs.centre[near] - blobs.centre[start]
