@@ -184,8 +184,7 @@ def _agreeing(
     views = arrange(_by_plane(points))
     rng = np.random.default_rng(options.seed)
     consensus = find_consensus(views, rng)
-    may_be_wide = options.distortion == "auto" or problem.distortion.wide
-    if may_be_wide and consensus.hopeless.any():
+    if options.distortion == "auto" or problem.distortion.wide:
         middle = (middle_of_image(problem) - views.pixel_centre) / views.pixel_scale
         consensus = find_consensus_through_wide_lens(consensus, views, middle, rng)
     kept = _kept_by(consensus, views, points)

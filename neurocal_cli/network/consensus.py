@@ -90,10 +90,12 @@ def find_consensus_through_wide_lens(
     """The same through a wide lens, which displaces points by more than outliers do.
 
     The networks learn rays instead of pixels, through equidistant lenses of several focal lengths; the lens
-    with the smallest scatter is used. `pinhole` is the consensus without a lens, and is returned unless a
-    lens reduces the scatter decidedly. `middle` (2,) is the assumed position of the optical axis, in
-    normalised pixels.
+    with the smallest scatter is used. `pinhole` is the consensus without a lens, and is returned unless its
+    scatter is that of a lens, in some view beyond all agreement, and a lens reduces it decidedly. `middle` (2,)
+    is the assumed position of the optical axis, in normalised pixels.
     """
+    if not pinhole.hopeless.any() or pinhole.looseness < _LOOSE:
+        return pinhole
     away = views.pixels - middle
     radius = np.hypot(*away.T)
     best, most = None, _TIGHTER * pinhole.looseness

@@ -35,6 +35,9 @@ _ROUNDS = 2  # rounds of selecting lenses and target alternately
 # A target that would move by less with the lenses selected on it (in std, rms over all points) has errors
 # that are at most 2 % larger, and the common adjustment still moves it.
 _SETTLED = 0.2
+# Nothing was left out of a camera: outliers are looked for again where an error of its target may have hidden
+# them, so where the rms error falls below this share with another target.
+_HIDDEN = 0.9
 _OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
@@ -83,8 +86,13 @@ def cameras_on_one_target(
     choice = options[names[0]].get("target", "auto")
 
     def camera(name: str, target: str | Target, start: Calibration | None, model: str = "") -> Calibration:
-        own = {"camera_name": name, **options[name], "target": target, "preferred": model, "start": start}
-        return calibrate(points[name], **own, progress=_named(progress, name))
+        own = {"camera_name": name, **options[name], "target": target, "preferred": model}
+        own["progress"] = _named(progress, name)
+        if start is None or len(start.rejected):
+            return calibrate(points[name], **own, start=start)
+        found = calibrate(points[name], **{**own, "outliers": "keep"}, start=start)
+        hardly = found.rmse_px > _HIDDEN * start.rmse_px
+        return found if hardly else calibrate(points[name], **own, start=found)
 
     def calibrated(target: str | Target, starts: Sequence[Calibration | None]) -> list[Calibration]:
         cameras = [camera(name, target, start) for name, start in zip(names, starts, strict=True)]
