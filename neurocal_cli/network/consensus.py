@@ -91,8 +91,8 @@ def find_consensus_through_wide_lens(
 
     The networks learn rays instead of pixels, through equidistant lenses of several focal lengths; the lens
     with the smallest scatter is used. `pinhole` is the consensus without a lens, and is returned unless its
-    scatter is that of a lens, in some view beyond all agreement, and a lens reduces it decidedly. `middle` (2,)
-    is the assumed position of the optical axis, in normalised pixels.
+    scatter is as large as a lens makes it, so that some view is hopeless, and a lens reduces it decidedly.
+    `middle` (2,) is the assumed position of the optical axis, in normalised pixels.
     """
     if not pinhole.hopeless.any() or pinhole.looseness < _LOOSE:
         return pinhole

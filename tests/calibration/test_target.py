@@ -178,6 +178,15 @@ def test_two_cameras_find_one_target() -> None:
     assert rig.rmse_px < 0.5 * given.rmse_px
 
 
+def test_outliers_that_the_given_target_hides_are_left_out_of_two_cameras() -> None:
+    left, right = photographed_pair(3)
+    wrong, pixels = [100, 166, 232, 298], left.pixels.copy()
+    pixels[wrong] += 0.4
+    left = replace(left, pixels=pixels)
+    assert not len(calibrate(left, distortion="none", skew=False, target="given").rejected)
+    assert calibrate_stereo(left, right, distortion="none", skew=False).left.rejected.rows.tolist() == wrong
+
+
 def test_a_calibration_goes_on_from_another_ones_camera_and_outliers_on_another_target() -> None:
     points, target = read_points(str(SAMPLE)), bent().target
     assert target is not None

@@ -16,6 +16,7 @@ from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, StereoRig, calibrate
+from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.rig import calibrate_rig
 from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
@@ -293,7 +294,10 @@ def test_cameras_are_calibrated_anew_only_on_a_target_that_moved(
 
     def one(points: Correspondences, **options: object) -> SimpleNamespace:
         done.append(options["target"])
-        return SimpleNamespace(distortion_model=next(models), target=None, lens_choice={})
+        kept = Rejected()
+        return SimpleNamespace(
+            distortion_model=next(models), target=None, lens_choice={}, rejected=kept, rmse_px=1.0
+        )
 
     monkeypatch.setattr(calibrate_rig, "calibrate", one)
     monkeypatch.setattr(calibrate_rig, "common_target", lambda cameras, choice: next(found))
