@@ -139,7 +139,7 @@ def calibrate(
         of the other camera of a rig.
     start : Calibration, optional
         Of the same points on another target: it starts there, instead of from random weights, if the same
-        parameters are given. Its lens and its outliers are judged again.
+        parameters are given. Its lens and its outliers are judged again. Not of several boards in one image.
     fix : dict of float by name, optional
         Parameters that are known, and stay as they are: alpha_u, alpha_v, u0, v0 [px], and coefficients of a
         named distortion model.
@@ -169,6 +169,9 @@ def calibrate(
     if points.image is not None:
         from neurocal_cli.calibration.arranged_boards import arranged
 
+        if start is not None:
+            raise UsageError("start needs one board in each image, but some have several; leave it out")
+
         def fitted(some: Mapping[str, Correspondences], target: TargetChoice | Target) -> Calibration:
             return calibrate(
                 some[camera_name], type, image_center, intrinsics, extrinsics, method, trainer, distortion,
@@ -184,9 +187,14 @@ def calibrate(
         known_target = replace(known_target, bends=None)
     choice = "given" if isinstance(target, Target) else target
     _check_options(method, trainer, distortion, outliers, choice, starts, seed, preferred)
-    angle = _angle_of(skew, square_pixels, method, distortion)
-    if fix and method != "neuro":
-        raise UsageError(f"fix needs the method neuro, but the method is {method}; leave it out")
+    needing = {
+        "fix": fix, "start": start, "square_pixels": square_pixels, "skew auto": skew == "auto",
+        f"target {choice}": choice in ("flat", "free"),
+        f"distortion {distortion}": distortion in ("plumb-line", "rich"),
+    }  # fmt: skip
+    if method != "neuro" and (named := next((name for name, given in needing.items() if given), None)):
+        raise UsageError(f"{named} needs the method neuro, but the method is {method}; leave it out")
+    angle = _angle_of(skew, square_pixels, distortion)
     if fix and "alpha_v" in fix and angle != "fixed":
         raise UsageError(
             "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
@@ -264,16 +272,12 @@ def _true_cause(points: Correspondences, type: int) -> str:
     return "; ".join(mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None) or ())
 
 
-def _angle_of(skew: bool | str, square_pixels: bool, method: str, distortion: str) -> str:
+def _angle_of(skew: bool | str, square_pixels: bool, distortion: str) -> str:
     """Whether the angle of the axes is "free", "fixed", or found to be one of them ("auto")."""
     if skew not in (True, False, *SKEWS):
         raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
-    if skew == "auto" and method != "neuro":
-        raise UsageError(f"skew auto needs the method neuro, but the method is {method}; give free or fixed")
     if not square_pixels:
         return "auto" if skew == "auto" else "free" if skew in (True, "free") else "fixed"
-    if method != "neuro":
-        raise UsageError(f"square_pixels needs the method neuro, but the method is {method}; leave it out")
     if distortion == "plumb-line":
         raise UsageError("square_pixels does not go with the distortion plumb-line; name k1k2p1p2 instead")
     if skew in ("free", "auto"):
@@ -349,8 +353,6 @@ def _lens_of(type: int, method: str, distortion: str, given: Camera | None) -> t
                 "leave it out"
             )
         return known, ""
-    if method != "neuro" and distortion in ("plumb-line", "rich"):
-        raise UsageError(f"distortion {distortion} needs the method neuro, but the method is {method}")
     if method != "neuro" and distortion == "auto":
         distortion = "k1" if method == "tsai" else "none"
     return (Distortion(), distortion) if distortion in _FOUND else (Distortion(distortion), "")
@@ -400,8 +402,6 @@ def _check_options(
     check_choice("distortion", distortion, DISTORTIONS)
     check_choice("outliers", outliers, OUTLIERS)
     check_choice("target", target, TARGETS)
-    if method != "neuro" and target in ("flat", "free"):
-        raise UsageError(f"target {target} needs the method neuro, but the method is {method}; leave it out")
     if not isinstance(starts, (int, np.integer)) or starts < 2:
         raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     check_seed(seed)

@@ -292,7 +292,7 @@ class _Tally:
         for pixels, labels in batches:
             self.first = pixels if self.first is None else self.first
             left, right = pixels[:, :2], pixels[:, 2:]
-            found = solve(rig.left, rig.right, rig.pose, left, right)
+            found = solve(rig, left, right)
             self.points += len(pixels)
             self.behind += int(found.behind.sum())
             self.off += int((found.off(self.limit) & ~found.behind).sum())

@@ -229,6 +229,11 @@ def test_a_calibration_of_other_points_is_no_start() -> None:
     start = calibrate(points.select(points.view_index < 3), target="given", distortion="none")
     with pytest.raises(UsageError, match="start must be a calibration of these points"):
         calibrate(points, start=start)
+    with pytest.raises(UsageError, match="start needs the method neuro, but the method is tsai"):
+        calibrate(points, method="tsai", start=start)
+    boards = replace(points, image=np.array(["one"] * len(points)))
+    with pytest.raises(UsageError, match="start needs one board in each image"):
+        calibrate(boards, start=start)
 
 
 def test_other_methods_take_the_target_as_given() -> None:

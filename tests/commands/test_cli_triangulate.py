@@ -60,7 +60,7 @@ def table(result: Result) -> tuple[list[str], dict[str, list[str]]]:
 
 
 def expected(rig: StereoRig, rows: Array, sigma: float) -> Array:
-    found = triangulate(rig.left, rig.right, rig.pose, rows[:, :2], rows[:, 2:])
+    found = triangulate(rig, rows[:, :2], rows[:, 2:])
     assert found.covariance is not None
     return np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
 

@@ -25,7 +25,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 
 _MAX_STEPS, _HALVINGS = 30, 8
@@ -106,12 +106,19 @@ def triangulate_many(
             f"point {twice // len(names)} is twice in camera {names[twice % len(names)]}; a camera sees a "
             "point once"
         )
-    views, n = [camera_of(one) for one in cameras.values()], 1 + int(point.max(initial=-1))
-    whitening = None if (noise == 1).all() else np.eye(2) / noise[rows, None, None]
+    own = zip(cameras.values(), noise.tolist(), strict=True)
+    views, n = [in_noise(camera_of(one), share) for one, share in own], 1 + int(point.max(initial=-1))
     relative = np.stack([poses[name].D for name in names])
-    whole = Sightings(views, rows, pixels, whitening, point, n, relative, rows)
+    whole = Sightings(views, rows, pixels / noise[rows, None], point, n, relative, rows)
     with np.errstate(all="ignore"):
         return _without_contradictions(whole, _found(whole), limit)
+
+
+def in_noise(camera: Camera, noise: float) -> Camera:
+    """The camera of pixels that are divided by their noise, so that a pixel of each camera counts alike."""
+    if noise == 1:
+        return camera
+    return replace(camera, intrinsics=Intrinsics.from_matrix(camera.A / [[noise], [noise], [1.0]]))
 
 
 @frozen_dataclass(eq=False)
@@ -121,7 +128,6 @@ class Sightings:
     cameras: Sequence[Camera]
     camera: NDArray[np.intp]  # (M,) that saw each pixel
     pixels: Array  # (M, 2)
-    whitening: Array | None  # (M, 2, 2) of the pixels' errors; None if their noise is alike
     point: NDArray[np.intp]  # (M,)
     n: int
     poses: Array  # (P, 3, 4) [R | t] of cameras, X_camera = R X + t
@@ -129,10 +135,9 @@ class Sightings:
 
     def only(self, rows: NDArray[np.bool_], numbers: NDArray[np.intp], n: int) -> Sightings:
         """Some of the pixels, whose n points have these numbers."""
-        whitening = None if self.whitening is None else self.whitening[rows]
         return replace(
-            self, camera=self.camera[rows], pixels=self.pixels[rows], whitening=whitening,
-            point=numbers[self.point[rows]], n=n, pose=self.pose[rows],
+            self, camera=self.camera[rows], pixels=self.pixels[rows], point=numbers[self.point[rows]], n=n,
+            pose=self.pose[rows],
         )  # fmt: skip
 
     @cached_property
@@ -160,7 +165,6 @@ class Sightings:
             projected, fine = camera.project(own)
             J = camera.project_jacobian(own)[1] @ by[mine] if by.size else by[mine, :2]
             J = np.concatenate([J, (self.pixels[mine] - projected)[..., None]], axis=2)
-            J = J if self.whitening is None else self.whitening[mine] @ J
             N[point] += np.swapaxes(J, 1, 2) @ J
             # A pixel's ray has one side only.
             seen[point] &= fine & ((own * self.rays[mine]).sum(axis=1) > 0)

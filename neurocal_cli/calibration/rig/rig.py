@@ -5,6 +5,7 @@ The poses are relative to the first camera: ``X_name = R X_first + t``, of two `
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
@@ -42,6 +43,19 @@ class FixedCameras(Presented):
     def sigma(self) -> float:
         """Standard deviation of the pixels of the calibration, in u and in v [px]."""
         return self.rmse_px / float(np.sqrt(2.0))
+
+    @property
+    @abstractmethod
+    def calibrations(self) -> tuple[Calibration, ...]:
+        """The cameras in their order."""
+
+    @property
+    def noise_shares(self) -> Array:
+        """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known."""
+        own = np.array([camera.sigma for camera in self.calibrations])
+        if not (self.sigma > 0 and np.isfinite(own).all()):
+            return np.ones(len(own))
+        return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
 
     @cached_property
     def verdict(self) -> Verdict | None:
@@ -104,6 +118,11 @@ class StereoRig(FixedCameras):
     delay: tuple[float, float] | None = None
 
     _summary = ("commands.show.rig_report", "stereo_report")
+
+    @property
+    def calibrations(self) -> tuple[Calibration, ...]:
+        """The left and the right camera."""
+        return self.left, self.right
 
     def __repr__(self) -> str:
         std = self.std.get("baseline", float("nan"))
@@ -240,15 +259,9 @@ class Rig(FixedCameras):
         return self.cameras[self.first].unit
 
     @property
-    def noise_shares(self) -> Array:
-        """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known.
-
-        Of two cameras it tells hardly anything about a point, and is 1.
-        """
-        own = np.array([camera.sigma for camera in self.cameras.values()])
-        if len(own) < 3 or not (self.sigma > 0 and np.isfinite(own).all()):
-            return np.ones(len(own))
-        return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
+    def calibrations(self) -> tuple[Calibration, ...]:
+        """The cameras in their order."""
+        return tuple(self.cameras.values())
 
     @property
     def edges(self) -> dict[tuple[str, str], int]:

@@ -1,7 +1,7 @@
 """Points in space from their pixels in both cameras, in the left camera's frame.
 
-`optimal` minimises the squared pixel errors of both images, with distortion. It is the maximum-likelihood
-point for Gaussian noise.
+`optimal` minimises the squared pixel errors of both images, with distortion, each over the noise of its
+camera. It is the maximum-likelihood point for Gaussian noise.
 
 `linear` takes the smallest singular vector of the four image equations, and `midpoint` the middle of the
 shortest segment between both rays. Both use undistorted pixels (Hartley and Sturm 1997).
@@ -17,10 +17,10 @@ from dataclasses import replace
 from typing import Any, Literal, get_args, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.many_views import Sightings
+from neurocal_cli.calibration.rig.many_views import Sightings, in_noise
 from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify
 from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.calibration.rig.two_view_points import PointBatch
@@ -37,7 +37,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
-from neurocal_cli.camera.given_values import real_rows
+from neurocal_cli.camera.given_values import real_array, real_rows
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, check_choice
 
@@ -53,10 +53,11 @@ _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 class Triangulated:
     """Points in the left camera's frame.
 
-    The covariance is that for pixels of covariance 1 px^2 (or of the given shape); times sigma^2 it is the
-    points'. The epipolar error is the length of the vector of four from both pixels to the images of the
-    point. For the optimal method it is the smallest shift that makes the rays intersect. It has one degree of
-    freedom, so its rms is the standard deviation of the pixels.
+    The covariance is that for pixels of covariance 1 px^2; times sigma^2 it is the points'. The epipolar
+    error is the length of the vector of four from both pixels to the images of the point. For the optimal
+    method it is the smallest shift that makes the rays intersect. It has one degree of freedom, so its rms is
+    the standard deviation of the pixels. Where the noise of the cameras is given, as it is by a rig, all of
+    these are those of its typical pixel: each camera counts by its noise.
     """
 
     # (N, 3) X, Y, Z [unit of t]; infinite or nan where rays are parallel or the distortion does not reach
@@ -96,7 +97,7 @@ def triangulate(
     *,
     which: NDArray[np.intp] | None = None,
     method: Method = "optimal",
-    whitening: tuple[Array, Array] | None = None,
+    noise: ArrayLike = (1.0, 1.0),
 ) -> Triangulated: ...
 
 
@@ -109,11 +110,12 @@ def triangulate(
     *,
     which: NDArray[np.intp] | None = None,
     method: Method = "optimal",
-    whitening: tuple[Array, Array] | None = None,
+    noise: ArrayLike = (1.0, 1.0),
 ) -> Triangulated:
     """Triangulate points from their pixels in two cameras.
 
-    Call it with a rig, ``triangulate(rig, left_pixels, right_pixels)``, or with its parts.
+    Call it with a rig, ``triangulate(rig, left_pixels, right_pixels)``, whose cameras count by their noise
+    (`StereoRig.noise_shares`), or with its parts.
 
     Parameters
     ----------
@@ -125,27 +127,31 @@ def triangulate(
     which : (N,) int array, optional
         Index of each point's rig among several.
     method : {"optimal", "linear", "midpoint"}
-    whitening : two of (N, 3) array, optional
-        Upper triangular factors of the pixels' inverse covariances: entries (0, 0), (0, 1), (1, 1). For
-        the optimal method.
+    noise : two of float
+        Standard deviations of the left and the right pixels, in any common unit.
 
     Raises
     ------
     UsageError
         An unknown method.
     InputError
-        Arrays of different lengths or wrong shapes, or a rig that is no Pose.
+        Arrays of different lengths or wrong shapes, a rig that is no Pose, or noise that is not positive.
     """
     check_choice("method", method, METHODS)
     if isinstance(left, StereoRig):
-        left, right, pose, left_pixels, right_pixels = left.left, left.right, left.pose, right, pose
+        noise, left_pixels, right_pixels = left.noise_shares, right, pose
+        left, right, pose = left.left, left.right, left.pose
     elif left_pixels is None or right_pixels is None:
         raise InputError("pixels are missing; give a StereoRig and pixels, or two cameras, a Pose and pixels")
     pixels = real_rows("pixels", left_pixels, 2), real_rows("pixels", right_pixels, 2)
     n = len(pixels[0])
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
-    cameras = camera_of(left), camera_of(right)
+    sigma = real_array("noise", noise)
+    if sigma.shape != (2,) or not (np.isfinite(sigma) & (sigma > 0)).all():
+        raise InputError("noise must be two positive numbers, those of the left and of the right pixels")
+    pixels = pixels[0] / sigma[0], pixels[1] / sigma[1]
+    cameras = in_noise(camera_of(left), float(sigma[0])), in_noise(camera_of(right), float(sigma[1]))
     poses = [pose] if isinstance(pose, Pose) else pose
     if not all(isinstance(one, Pose) for one in poses):
         raise InputError("the rig must be a Pose, such as Pose(R, t), or a sequence of them")
@@ -161,13 +167,12 @@ def triangulate(
         for start in range(0, n, _BLOCK):
             rows = slice(start, start + _BLOCK)
             left_seen, right_seen = pixels[0][rows], pixels[1][rows]
-            factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
             rig = np.moveaxis(rigs if which is None else rigs[which[rows]], 0, -1)
             if covariance is not None and not wide:
-                batch = PointBatch(cameras, rig, left_seen.T, right_seen.T, factors)
+                batch = PointBatch(cameras, rig, left_seen.T, right_seen.T)
                 points[rows], covariance[rows], epipolar[rows], behind[rows] = batch.optimal()
                 continue
-            seen = _sightings(cameras, rig, left_seen, right_seen, factors)
+            seen = _sightings(cameras, rig, left_seen, right_seen)
             if covariance is not None:
                 points[rows], covariance[rows], cost, behind[rows] = seen.fitted()
             else:
@@ -180,20 +185,13 @@ def triangulate(
     return Triangulated(points, covariance, epipolar, behind)
 
 
-def _sightings(
-    cameras: tuple[Camera, Camera], rig: Array, left: Array, right: Array, factors: tuple[Array, Array] | None
-) -> Sightings:
-    """The pixels of both cameras; the rig (3, 4, n or 1) and the factors are as for `PointBatch`."""
+def _sightings(cameras: tuple[Camera, Camera], rig: Array, left: Array, right: Array) -> Sightings:
+    """The pixels of both cameras; the rig (3, 4, n or 1) is as for `PointBatch`."""
     n, m = len(left), rig.shape[2]
-    side, whitening = np.repeat([0, 1], n), None
-    if factors is not None:
-        whitening = np.zeros((2 * n, 2, 2))
-        whitening[:, 0, 0], whitening[:, 0, 1], whitening[:, 1, 1] = np.concatenate(factors, axis=1)
     pose = np.append(np.zeros(n, dtype=np.intp), 1 + np.arange(n) % m)
     poses = np.concatenate([np.eye(3, 4)[None], np.moveaxis(rig, -1, 0)])
-    return Sightings(
-        cameras, side, np.concatenate([left, right]), whitening, np.tile(np.arange(n), 2), n, poses, pose
-    )
+    side, pixels = np.repeat([0, 1], n), np.concatenate([left, right])
+    return Sightings(cameras, side, pixels, np.tile(np.arange(n), 2), n, poses, pose)
 
 
 def _midpoint(seen: Sightings) -> Array:

@@ -27,19 +27,11 @@ _RISE, _ROUNDING = 1 + 1e-9, 1e-18
 class PointBatch:
     """Some thousand points, all arrays (n,).
 
-    The rig (3, 4, n) or (3, 4, 1) is [R | t] of each point, or of all. The pixels are (2, n), and the entries
-    of their whitening (3, n).
+    The rig (3, 4, n) or (3, 4, 1) is [R | t] of each point, or of all. The pixels are (2, n).
     """
 
-    def __init__(
-        self,
-        cameras: tuple[Camera, Camera],
-        rig: Array,
-        left: Array,
-        right: Array,
-        whitening: tuple[Array, Array] | None,
-    ) -> None:
-        self.cameras, self.pixels, self.whitening = cameras, (left, right), whitening
+    def __init__(self, cameras: tuple[Camera, Camera], rig: Array, left: Array, right: Array) -> None:
+        self.cameras, self.pixels = cameras, (left, right)
         # Plain numbers for a common rig are faster than arrays of one element.
         entries = rig[..., 0].tolist() if rig.shape[2] == 1 else rig
         self.R, self.t = [row[:3] for row in entries], [row[3] for row in entries]
@@ -115,20 +107,11 @@ class PointBatch:
         """Normal equations: xx, xy, xw, yy, yw, ww, then the right-hand sides x, y, w; and the cost."""
         u, v, (ux, uy, vx, vy) = self._image(0, x, y)
         du, dv = self.pixels[0][0] - u, self.pixels[0][1] - v
-        if self.whitening is not None:
-            p, q, r = self.whitening[0]
-            du, ux, uy = p * du + q * dv, p * ux + q * vx, p * uy + q * vy
-            dv, vx, vy = r * dv, r * vx, r * vy
         xx, xy, yy = ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy
         gx, gy = ux * du + vx * dv, uy * du + vy * dv
         cost = du * du + dv * dv
         u, v, (ux, uy, uw), (vx, vy, vw) = self._right(x, y, w)
         du, dv = self.pixels[1][0] - u, self.pixels[1][1] - v
-        if self.whitening is not None:
-            p, q, r = self.whitening[1]
-            du = p * du + q * dv
-            ux, uy, uw = p * ux + q * vx, p * uy + q * vy, p * uw + q * vw
-            dv, vx, vy, vw = r * dv, r * vx, r * vy, r * vw
         cost = cost + du * du + dv * dv
         return [
             xx + ux * ux + vx * vx, xy + ux * uy + vx * vy, ux * uw + vx * vw,

@@ -1,5 +1,7 @@
 """Triangulation: the least-squares point, its covariance, and OpenCV's beside it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from support.rigs import KINDS, RigScene, random_rig
 from support.slow_cases import slow_but
 
-from neurocal_cli import Pose
+from neurocal_cli import Pose, calibrate_stereo
 from neurocal_cli.calibration.rig.triangulation import METHODS, Triangulated, epipolar_limit, triangulate
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
@@ -47,7 +49,8 @@ def test_a_rig_stands_for_its_cameras_and_their_pose() -> None:
 
     left, right = (read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right"))
     rig: Rig = calibrate_stereo(left, right, skew=False, distortion="none", target="given")
-    parts = triangulate(rig.left, rig.right, rig.pose, left.pixels, right.pixels)
+    noise = rig.noise_shares
+    parts = triangulate(rig.left, rig.right, rig.pose, left.pixels, right.pixels, noise=noise)
     whole = triangulate(rig, left.pixels, right.pixels)
     np.testing.assert_array_equal(whole.points, parts.points)
     found = whole.space_covariance(rig.sigma)
@@ -90,8 +93,8 @@ def test_opencv_gives_the_same_without_noise_and_never_better_with_noise(seed: i
 
 
 @pytest.mark.parametrize("lens", ["none", "k1k2", "fisheye"])
-@pytest.mark.parametrize("whitened", slow_but((True,), [False, True]))
-def test_the_point_is_the_minimum_of_the_pixel_error(lens: str, whitened: bool) -> None:
+@pytest.mark.parametrize("ratio", slow_but((0.2,), [1.0, 0.2]))
+def test_the_point_is_the_minimum_of_the_pixel_error_over_the_noise(lens: str, ratio: float) -> None:
     from dataclasses import replace
 
     from scipy.optimize import least_squares
@@ -102,23 +105,12 @@ def test_the_point_is_the_minimum_of_the_pixel_error(lens: str, whitened: bool) 
         scene = replace(scene, lenses=(Distortion("fisheye", np.array([0.02, -0.01, 0.0, 0.0])),) * 2)
     X, left, right = scattered(scene, 12, rng)
     left, right = left + rng.normal(size=left.shape), right + rng.normal(size=right.shape)
-    factors = rng.uniform(0.5, 2, (2, 12, 3)) * [1, 0.4, 1]
-    found = triangulate(
-        scene.camera(0),
-        scene.camera(1),
-        scene.rig,
-        left,
-        right,
-        whitening=tuple(factors) if whitened else None,
-    )
+    noise = 2.0 * ratio, 2.0
+    found = triangulate(scene.camera(0), scene.camera(1), scene.rig, left, right, noise=noise)
 
     def errors(x: Array, n: int) -> Array:
         seen = scene.see(0, x[None])[0], scene.see(1, (x @ scene.rig.R.T + scene.rig.t)[None])[0]
-        out = []
-        for pixels, image, (p, q, r) in zip((left[n], right[n]), seen, factors[:, n], strict=True):
-            e = pixels - image
-            out += [p * e[0] + q * e[1], r * e[1]] if whitened else e.tolist()
-        return np.array(out)
+        return np.concatenate([(left[n] - seen[0]) / noise[0], (right[n] - seen[1]) / noise[1]])
 
     for n in range(12):
         fit = least_squares(errors, X[n], args=(n,), xtol=1e-15, ftol=1e-15, x_scale="jac")
@@ -143,6 +135,30 @@ def test_the_covariance_is_that_of_the_errors(kind: str) -> None:
     assert chi.mean() == pytest.approx(3, rel=0.05)
     assert np.sqrt((found.epipolar**2).mean()) == pytest.approx(sigma, rel=0.02)
     assert found.off(epipolar_limit(sigma)).sum() < 3
+
+
+def test_each_of_two_cameras_counts_by_its_noise() -> None:
+    """The covariance is that of the errors, which are smaller than those of a pooled noise."""
+    rng, sigma = np.random.default_rng(9), (0.05, 0.5)
+    scene = random_rig(rng, "parallel", 12)
+    left, right = (scene.points(side, sigma[side], rng) for side in (0, 1))
+    rig = calibrate_stereo(left, right, skew=False, distortion="none", target="given")
+    assert rig.noise_shares * rig.sigma == pytest.approx(sigma, rel=0.2)
+    assert rig.noise_shares == pytest.approx(replace(rig.lean, warnings=()).noise_shares)
+    X = np.tile([0.0, 0.0, np.mean([pose.t[2] for pose in scene.poses.values()])], (4000, 1))
+    exact = rig.left.camera.project(X)[0], rig.right.camera.project(rig.pose.to_camera(X))[0]
+    pixels = [one + rng.normal(0, s, one.shape) for one, s in zip(exact, sigma, strict=True)]
+    found, alike = triangulate(rig, *pixels), triangulate(rig.left, rig.right, rig.pose, *pixels)
+    assert found.covariance is not None
+    squares = [((one.points - X) ** 2).mean(axis=0) for one in (found, alike)]
+    stated = rig.sigma**2 * found.covariance[:, [0, 3, 5]].mean(axis=0)
+    assert squares[0] == pytest.approx(stated, rel=0.3)
+    assert (squares[0] < [1.01, 0.1, 1.01] * squares[1]).all()
+    assert np.sqrt((found.epipolar**2).mean()) == pytest.approx(rig.sigma, rel=0.2)
+    assert found.off(epipolar_limit(rig.sigma)).mean() < 0.001
+    for wrong in (0.3, (1.0, 0.0), (1.0, np.nan), (1.0, 2.0, 3.0)):
+        with pytest.raises(InputError, match="noise must be two positive numbers"):
+            triangulate(rig.left, rig.right, rig.pose, *pixels, noise=wrong)
 
 
 def test_each_point_may_have_a_rig_of_its_own() -> None:
