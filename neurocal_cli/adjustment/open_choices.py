@@ -124,22 +124,25 @@ def fisheye_sizes(far: float) -> Array:
     return np.array([share / far**power for _, power, share in _FISHEYE])
 
 
-def _open_coefficients(
-    model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
+def open_at_points(
+    state: CameraState, points: Correspondences, free: NDArray[np.bool_], tried: Collection[str]
 ) -> OpenCoefficients | None:
-    """Open coefficients of a selected distortion model with coefficients k (K,); None if there are none.
+    """Open coefficients of a camera in pixels and world units, known from its points; None if there are none.
 
-    `free` (5 + K,) tells which of A's entries and the coefficients were estimated. `choice` contains the
-    candidate models of the selection; it is empty if the user named the model. `reach` is the `radius` of the
-    farthest point, and `corner` that of the image's farthest corner.
+    The poses of the state are in the order of the points' views. `free` (5 + K,) tells which of A's entries
+    and the coefficients were estimated, `tried` among which models this one was selected; it is empty if the
+    user named the model.
     """
+    seen = (state.R[points.view_index] @ points.world[..., None])[..., 0] + state.t[points.view_index]
+    reach, corner = _farthest(seen), _corner_radius(state.entries[0], points.image_size)
+    model = state.model
     own = coefficient_names(model)
     wide = model == "fisheye"
-    richer = DECENTRED[model] if wide else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
+    richer = DECENTRED[model] if wide else next((m for m in POLYNOMIAL_MODELS[::-1] if m in tried), "none")
     names = coefficient_names(richer)
-    if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
+    if not tried or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
         return None
-    value = dict(zip(own, k.tolist(), strict=True))
+    value = dict(zip(own, state.k.tolist(), strict=True))
     estimated = {name for name, is_free in zip(own, free[5:].tolist(), strict=True) if is_free}
     may_be_noise = () if wide else _NOISE_MAY_MAKE
     open_names = [name for name in names if name not in estimated or name in may_be_noise]
@@ -167,19 +170,6 @@ def _open_coefficients(
         (_ODDS,) * len(groups),
     )
     return OpenCoefficients(richer, reported, everything, prior)
-
-
-def open_at_points(
-    state: CameraState, points: Correspondences, free: NDArray[np.bool_], tried: Collection[str]
-) -> OpenCoefficients | None:
-    """Open coefficients of a camera in pixels and world units, known from its points; None if there are none.
-
-    The poses of the state are in the order of the points' views. `free` (5 + K,) tells which of A's entries
-    and the coefficients were estimated, `tried` among which models this one was selected.
-    """
-    seen = (state.R[points.view_index] @ points.world[..., None])[..., 0] + state.t[points.view_index]
-    corner = _corner_radius(state.entries[0], points.image_size)
-    return _open_coefficients(state.model, state.k, free, tried, _farthest(seen), corner)
 
 
 @quietly

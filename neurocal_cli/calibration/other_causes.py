@@ -27,16 +27,14 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
+from neurocal_cli.calibration.verdict.findings import DETERMINE
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import causes_among
 from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, NEIGHBOURS, ODD_VIEW
 from neurocal_cli.camera.geometry import Array, median
 
-_TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
-
 # Of one view. Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean
 # ones, none blamed) and test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
-_FEWEST = 4  # fewest views, so that the others outvote one
 OUTLIER = 25.0
 """Least contradiction of an odd view, times that which noise causes, and that of the other views."""
 _OWN_STEPS = 60
@@ -50,9 +48,10 @@ def has_other_cause(
     It may be noise that neighbours share. Each camera is at its minimum for the given target. `worth` is the
     effective share of the views if they repeat poses.
     """
-    # One or two views of planes that bend and were set up by hand show distortion as another target.
+    # One or two views of planes that bend and were set up by hand show distortion as another target
+    # (test_cli_stereo.py).
     n_views = sum(problem.views.n_views for problem, _ in fits)
-    if named_lens and n_views < _TELL_BENDS and richer_lens_is_better(found):
+    if named_lens and n_views < DETERMINE and richer_lens_is_better(found):
         return True
     fits = views_for_target(fits)
     # An equation of the contest, which is on the given target, may count less on the found one.
@@ -96,7 +95,7 @@ def odd_view(solution: Solution) -> str | None:
     """
     problem, adjusted = solution.problem, solution.adjusted
     views, free = problem.views, problem.free_of_prior
-    if views.n_views < _FEWEST or problem.type == 3 or not problem.free_poses:
+    if views.n_views <= DETERMINE or problem.type == 3 or not problem.free_poses:
         return None
     conditions = conditions_on_views(views, adjusted.state)
     spare = views.equations - 6 - conditions

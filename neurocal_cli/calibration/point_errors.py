@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.common_noise import common_share, measured, with_common_share
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.verdict.findings import FEW_POINTS, pixel_spread
@@ -24,7 +25,8 @@ FLOOR = 1e-7  # of the pixels' spread: errors below this are rounding, not noise
 _CHANCE = 0.01  # of calling any point of a good data set wrong
 _WORST_VIEW = 3.0  # cap on a view's own noise level, in units of the noise level of all views
 _ORDINARY = 6.0  # times the median error: only points below test whether the stated sigmas hold
-_LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
+MEDIAN, _ONE = 1.1774, 0.6745
+"""Median length of two normal errors, and of one."""
 
 
 @frozen_dataclass(eq=False)
@@ -127,13 +129,13 @@ def squared_whitened(r: Array, covariance: Array) -> Array:
 
 def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
     """Independent errors of each point with the same standard deviation; see `PointErrors`."""
-    alike = length[:, None] * (_ONE / _LENGTH)
+    alike = length[:, None] * (_ONE / MEDIAN)
     if across is None:
         return alike
     known = np.isfinite(length) & single(across)
     residuals, n = np.where(known[:, None], residuals, 0.0), unit(across)
     own = np.stack([(residuals * n).sum(axis=1), (residuals * n[:, ::-1] * [-1, 1]).sum(axis=1)], axis=1)
-    share = np.abs(own) / np.maximum(np.hypot(*residuals.T), 1e-300)[:, None]
+    share = np.abs(own) / np.maximum(np.hypot(*residuals.T), NOTHING)[:, None]
     return np.where(known[:, None], share * np.where(known, length, 0.0)[:, None], alike)
 
 

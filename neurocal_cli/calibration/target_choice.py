@@ -41,7 +41,8 @@ from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
 from neurocal_cli.calibration.other_causes import contest_of, contradicts_sigma, has_other_cause
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
-from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
+from neurocal_cli.calibration.point_errors import MEDIAN, places_of_views, rms, squared_whitened
+from neurocal_cli.calibration.verdict.findings import DETERMINE
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.network.options import Options
@@ -167,12 +168,10 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
 _ROUNDS = 3
 _WORTH = 0.8  # least effective share of the views, where some repeat a pose
 _SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
-_FEWEST = 3  # fewest views for bends
 # Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
 # most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
 # half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
-_MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
 _HALVINGS = 30
 _LEAST_NOISE = 1e-3  # least pixel noise, as a share of the residuals' level
 
@@ -355,7 +354,7 @@ def _may_bend(problem: Problem, known: Target | None) -> bool:
 
     `known` is the estimated target, if there is one.
     """
-    if not problem.free_poses or problem.views.n_views < _FEWEST or problem.points.distances:
+    if not problem.free_poses or problem.views.n_views < DETERMINE or problem.points.distances:
         return False
     if known is not None:
         return is_flat(known.given) and not known.plane.any()
@@ -423,9 +422,9 @@ def _with_places(solution: Solution, points: Correspondences, factor: float) -> 
     r, place = seen[known] - points.pixels[known], place.T[known]
 
     def level(variance: float) -> float:
-        return float(median(squared_whitened(r, variance * own[known] + place))) / _MEDIAN
+        return float(median(squared_whitened(r, variance * own[known] + place))) / MEDIAN**2
 
-    high = float(median(squared_whitened(r, own[known]))) / _MEDIAN
+    high = float(median(squared_whitened(r, own[known]))) / MEDIAN**2
     low = high * _LEAST_NOISE**2
     for _ in range(_HALVINGS):
         middle = float(np.sqrt(low * high))

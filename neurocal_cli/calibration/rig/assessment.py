@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import quietly
-from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.adjustment.normal_equations import NOTHING, ROUNDING, solve_scaled
 from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
@@ -37,6 +37,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Finding,
     Limit,
     name_some,
+    percent,
     verdict_of,
 )
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -92,7 +93,7 @@ def _evidence(rig: Rig) -> _Evidence:
     squares, degrees = scatter(fit)
     equations = sum(observed.views.n_equations for observed in fit.problem.observations)
     spare = max(equations - 6 * sum(map(len, fit.problem.names)) - int(fit.free.sum()), 1.0)
-    alone = max(fit.cost - squares, 1e-300)
+    alone = max(fit.cost - squares, NOTHING)
     cause, rest = named_cause(fit, names)
     # Frames that contradict each other have one target with an error that none of the cameras made.
     alone_at_fault = not _SCATTER.grade(rest)
@@ -318,13 +319,13 @@ def _precision(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     of_two = f" of points that {first} and {second} see" if len(seen) > 2 else ""
     yield (
         SHARE.grade(e.depth_share),
-        f"the std of triangulated depth{of_two} is {100 * e.depth_share:.2g} % of the depth",
+        f"the std of triangulated depth{of_two} is {percent(e.depth_share)} of the depth",
         more,
     )
     what = "the baseline"
     if len(seen) > 2:
         what = f"the distance of {second} from {first}, its nearest neighbour,"
-    yield SHARE.grade(share), f"the std of {what} is {100 * share:.2g} % of its length", more
+    yield SHARE.grade(share), f"the std of {what} is {percent(share)} of its length", more
     if np.isfinite(e.held_out):
         yield (
             ELSEWHERE.grade(e.held_out),

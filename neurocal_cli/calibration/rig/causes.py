@@ -29,6 +29,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Said,
     in_sequence,
     likeliest,
+    percent,
 )
 from neurocal_cli.calibration.verdict.rival import ABSORBED, Found, Known, Pattern, Unknowns
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -154,7 +155,7 @@ def _has_zoomed(found: Named) -> Said:
 def _larger(found: Named) -> str:
     """By how much a target is larger, seen nearer, than it should be."""
     larger = np.expm1(-np.log1p(found.amount))
-    return f"{100 * abs(larger):.2g} % {'larger' if larger > 0 else 'smaller'}"
+    return f"{percent(abs(larger))} {'larger' if larger > 0 else 'smaller'}"
 
 
 def _has_another_target(found: Named) -> Said:

@@ -27,9 +27,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, median, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
 
-_MOST_HYPOTHESES = 200  # offers that are tried
-
-
 # Two pairs agree if their targets differ in the image by less than this share of the target's size or by less
 # than so many standard deviations of a pixel. The tests of named faults in test_stereo_evaluation.py
 # repeat that faults are found and sound pairs kept.
@@ -312,7 +309,7 @@ def _possible(camera: Calibration, view: str) -> list[ViewResult]:
 def _nearest(R: Array, t: Array, distance: Array) -> Array:
     """(P,) which offer of each pair is nearest to the rig; R (P, 4, 3, 3), t (P, 4, 3), distance (P, 4)."""
     flat_R, flat_t = R.reshape(-1, 3, 3), t.reshape(-1, 3)
-    some = np.unique(np.linspace(0, len(flat_R) - 1, _MOST_HYPOTHESES).astype(int))
+    some = np.unique(np.linspace(0, len(flat_R) - 1, R.shape[1] * _HYPOTHESES).astype(int))
     cosine = 0.5 * (np.einsum("hij,pcij->hpc", flat_R[some], R) - 1)
     shift = np.linalg.norm(flat_t[some][:, None, None] - t, axis=3) / distance
     away = np.arccos(np.clip(cosine, -1.0, 1.0)) + shift  # (H, P, 4) [rad]

@@ -27,6 +27,7 @@ from neurocal_cli.adjustment.cross_validation import (
     reduced,
 )
 from neurocal_cli.adjustment.free_networks import conditions_on_views, free_networks, seen_from_behind
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
@@ -41,6 +42,7 @@ from neurocal_cli.calibration.calibration import (
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
+    ROUNDED,
     SPARE,
     Finding,
     pixel_spread,
@@ -68,8 +70,6 @@ from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import std_of_scale
 
-# Of the pixels' spread, 0.01 px of 12 Mpx: a smaller error is that of rounded numbers, and has no cause.
-_ROUNDING = 1e-5
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
 _DISTANT = 10.0  # times the distance of the farthest point
@@ -277,7 +277,7 @@ class _AtMinimum:
             yield from stated_survey(target, self.calibration.rmse_px, given_px)
 
     def _is_exact(self) -> bool:
-        return self.calibration.rmse_px < _ROUNDING * pixel_spread(self.points)
+        return self.calibration.rmse_px < ROUNDED * pixel_spread(self.points)
 
     @cached_property
     def networks(self) -> Array:
@@ -286,7 +286,7 @@ class _AtMinimum:
 
     def _held_out(self) -> float:
         lost = self._held_out_with_prior() if self.state.model == "rich" else held_out(self.minimum)
-        return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
+        return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, NOTHING)))
 
     def _held_out_with_prior(self) -> Array:
         """Squared errors of held-out views, with a rich lens's displacement estimated without them.
@@ -314,13 +314,10 @@ class _AtMinimum:
         return float(np.sqrt(of_point * own)) * px, float(ratio)
 
     def _contest(self) -> Contest | None:
-        """The causes of the residuals."""
+        """The causes of the residuals; with outliers, if one that all views share explains most of them."""
         if self._is_exact():
             return None
-        return self._with_outliers(self._contest_at(self.views, self.state))
-
-    def _with_outliers(self, kept: Contest | None) -> Contest | None:
-        """The same with the outliers, if a cause that all views share explains most of their error."""
+        kept = self._contest_at(self.views, self.state)
         if self.calibration.rejected.points is None or self.calibration.target is not None:
             return kept
         points = with_rejected(self.calibration)

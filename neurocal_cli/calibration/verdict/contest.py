@@ -19,6 +19,7 @@ from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.effects import another_lens, common, field
 from neurocal_cli.calibration.verdict.findings import (
+    DETERMINE,
     DISPLACED,
     ERROR,
     EXPLAINED,
@@ -38,18 +39,16 @@ from neurocal_cli.calibration.verdict.rivals import (
     RIVALS,
     SHAPES,
 )
-from neurocal_cli.calibration.verdict.words import DETERMINE, NEAR
+from neurocal_cli.calibration.verdict.words import NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-_MOST_CAUSES = 3  # at once
-_TRIED = 3  # rivals that are tried together with another one
+_MOST = 3  # causes at once, and rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
-_BESIDE = 0.3  # share of the evidence from which on a cause counts beside the target's shape
+_MUCH = 0.3  # share of the evidence beside the target's shape, or of the error of a lens, that counts
 _FAR_MORE = 2.0  # times the log evidence of an estimated target
-_EXPLAINS_MUCH = 0.3  # share of the squared error from which on a lens or a given value is fitted
 
 
 @frozen_dataclass(eq=False)
@@ -83,7 +82,7 @@ class Contest:
             return 0.0
         others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
         told = sum(one.evidence for one in self.causes)
-        if max(others, default=0.0) > _BESIDE * told or first.rival.unknown or first.pattern == "one":
+        if max(others, default=0.0) > _MUCH * told or first.rival.unknown or first.pattern == "one":
             return worth * self.evidence - LEVEL
         # A shape that is far more probable than the found one is not open: no print is stretched by percents.
         return worth * told / _FAR_MORE if first.pattern == "all" else 0.0
@@ -154,14 +153,14 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
         if of_two is not None:
             alike = min(alike, correlation(lin.views, of_two))
         n = effective_number(n, alike)
-        fits = [(one, _fit(lin, one)) for one in estimates(lin, n, rivals)]
+        fits = [(one, _fitted(lin, one)) for one in estimates(lin, n, rivals)]
         fitted = {one.rival.cause for one, fit in fits if fit is not None}
-        ranking = sorted((_refined(lin, *one) for one in fits), key=lambda one: -one.evidence)
+        ranking = sorted((fit or one for one, fit in fits), key=lambda one: -one.evidence)
     share = n / lin.spare
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
     causes: list[Estimate] = []
     close: list[tuple[Estimate, ...]] = []
-    while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST_CAUSES:
+    while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, share, rivals)
         far = not chosen[0].weights.size or chosen[0].rival.cause in fitted
@@ -214,7 +213,7 @@ def _best(
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
-    for one in [one for one in others if one.weights.size][:_TRIED]:
+    for one in [one for one in others if one.weights.size][:_MOST]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others([one], rivals), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
@@ -224,50 +223,37 @@ def _best(
     return best
 
 
-@frozen_dataclass(eq=False)
-class _Fit:
-    """A rival that was fitted, because it looks different beyond the linear range."""
+def _fitted(lin: Linearised, one: Estimate) -> Estimate | None:
+    """Fit a cause that looks different beyond the linear range; None for others.
 
-    cost: float
-    entries: Array | None = None  # of A, if the views share one camera
-
-
-def _refined(lin: Linearised, one: Estimate, fit: _Fit | None) -> Estimate:
-    """The estimate with the cost of its fit, if there is one and it is lower."""
-    left = (1.0 - one.explained) * lin.cost
-    if fit is None or not 0 < fit.cost < left:
+    Two cameras that are far apart are fitted, and lenses and given values that explain much.
+    """
+    views, state = lin.views, lin.state
+    of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
+    if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > NEAR:
+        free, member = lin.free, one.weights > 0.5
+        groups = [np.flatnonzero(member), np.flatnonzero(~member)]
+    elif (of_given or one.rival in RICHER_LENSES) and one.explained > _MUCH:
+        free = np.append(lin.free, np.flatnonzero(one.rival.steps_at(lin).any(axis=1)))
+        groups = [np.arange(views.n_views)]
+    else:
+        return None
+    moving = np.isin(np.arange(5 + len(state.k)), free)
+    fits = [adjust(views.subset(some).batches, state.of_views(some), moving, True, NEARBY) for some in groups]
+    cost, left = sum(float(fit.cost.sum()) for fit in fits), (1.0 - one.explained) * lin.cost
+    if not 0 < cost < left:
         return one
     n, camera, amounts = left / one.noise, one.camera, one.amounts
-    if fit.entries is not None:
-        step, camera = fit.entries - lin.state.entries[0], camera.copy()
+    if len(fits) == 1:
+        step, camera = fits[0].state.entries[0] - lin.state.entries[0], camera.copy()
         of_entries = lin.free < 5
         camera[of_entries] = step[lin.free[of_entries]]
         if one.rival.of_given and one.rival.steps_at(lin)[:5].any():
             amounts = step[lin.given[lin.given != 1]] / lin.state.entries[0, 0]
-    gained = 0.5 * n * float(np.log(left / fit.cost))
     return replace(
-        one, evidence=one.evidence + gained, explained=1.0 - fit.cost / lin.cost, amounts=amounts,
-        camera=camera, noise=fit.cost / n,
+        one, evidence=one.evidence + 0.5 * n * float(np.log(left / cost)), explained=1.0 - cost / lin.cost,
+        amounts=amounts, camera=camera, noise=cost / n,
     )  # fmt: skip
-
-
-def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
-    """Fit two cameras that are far apart, and lenses and given values that explain much; None for others."""
-    views, state, K = lin.views, lin.state, len(lin.state.k)
-    if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > NEAR:
-        free, member = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5
-        groups = np.flatnonzero(member), np.flatnonzero(~member)
-        each = [
-            adjust(views.subset(some).batches, state.of_views(some), free, True, NEARBY) for some in groups
-        ]
-        return _Fit(sum(float(fit.cost.sum()) for fit in each))
-    of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
-    if (of_given or one.rival in RICHER_LENSES) and one.explained > _EXPLAINS_MUCH:
-        added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
-        free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
-        fit = adjust(views.batches, state, free, True, NEARBY)
-        return _Fit(float(fit.cost.sum()), fit.state.entries[0])
-    return None
 
 
 def _steps(lin: Linearised, found: Estimate) -> Array:

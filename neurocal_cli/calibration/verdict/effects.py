@@ -12,11 +12,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.cross_validation import Quadratics
 from neurocal_cli.adjustment.normal_equations import NOTHING
-from neurocal_cli.calibration.verdict.findings import in_sequence
+from neurocal_cli.calibration.verdict.findings import DETERMINE, in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen
-from neurocal_cli.calibration.verdict.rival import Pattern, Steps
+from neurocal_cli.calibration.verdict.rival import ABSORBED, Pattern, Steps
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
@@ -178,9 +177,7 @@ def _of_entries(lin: Linearised, *changes: Array) -> Array:
     return steps
 
 
-_FEWEST = 4  # fewest views that can show a change between them
 _BY_POSE = 6.0  # ways in which poses differ, with which errors of the lens are correlated
-_STARTS = _ROUNDS = 20
 
 
 def common(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
@@ -191,14 +188,14 @@ def common(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
 def one_view(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
     """Each view alone."""
     V = lin.views.n_views
-    if V >= _FEWEST - 1:
+    if V >= DETERMINE:
         yield "one", np.eye(V), float(V)
 
 
 def changing(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
     """Along the sequence, with the distance, with the tilt of the target, or between groups."""
     views, state = lin.views, lin.state
-    if views.n_views < _FEWEST:
+    if views.n_views <= DETERMINE:
         return
     yield "line", _ramp(_places(lin).astype(float)), 1.0
     distance = np.linalg.norm(state.t, axis=1) * views.scale
@@ -214,11 +211,11 @@ def changing(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
 def grouped(lin: Linearised, S: Array, g: Array) -> Iterator[Pattern]:
     """From a view on, every other view, or any two groups."""
     V, place = lin.views.n_views, _places(lin)
-    if V < _FEWEST:
+    if V <= DETERMINE:
         return
     yield step(place)
     yield "groups", (place % 2 == 1).astype(float), 1.0
-    yield "groups", _two_groups(S, g, lin.R[:, -1, -1]), float(2.0 ** min(V - 1, 1000))
+    yield "groups", step(_by_change(S, g))[1], float(2.0 ** min(V - 1, 1000))
 
 
 def step(place: NDArray[np.intp]) -> Pattern:
@@ -236,36 +233,14 @@ def _ramp(values: Array) -> Array:
     return (values - values.mean()) / max(float(np.ptp(values)), NOTHING)
 
 
-def _two_groups(S: Array, g: Array, cost: Array) -> Array:
-    """(P, V) candidates for the two groups of views that differ most, each of two views or more."""
-    V, m = g.shape
-    if m == 1:  # one of the divisions of the sorted values
-        rank = np.argsort(np.argsort(g[:, 0] / np.maximum(S[:, 0, 0], NOTHING), kind="stable"))
-        return (rank >= np.arange(2, V - 1)[:, None]).astype(float)
-    member = _divided(Quadratics(S, g, cost))
-    if member is None or min(np.count_nonzero(member), np.count_nonzero(~member)) < 2:
-        return np.zeros((1, V))
-    return member[None].astype(float)
+def _by_change(S: Array, g: Array) -> NDArray[np.intp]:
+    """(V,) place of each view by the change for which it asks, along the direction in which they differ most.
 
-
-def _divided(q: Quadratics) -> NDArray[np.bool_] | None:
-    """The best division into two groups from several random starts, as k-means finds it."""
-    V = len(q.cost)
-    member = np.random.default_rng(0).random((_STARTS, V)) < 0.5
-    best, division = np.inf, None
-    for _ in range(_ROUNDS):
-        steps = q.steps(np.concatenate([member, ~member]).astype(float))  # (2 starts, m)
-        squares = (steps[:, :, None] * steps[:, None]).reshape(len(steps), -1)
-        cost = q.cost - 2 * steps @ q.g.T + squares @ q.S.reshape(V, -1).T
-        first, second = cost[:_STARTS], cost[_STARTS:]
-        total = np.minimum(first, second).sum(axis=1)
-        nearer = first < second
-        if not np.isfinite(total).any():
-            break
-        place = int(np.nanargmin(total))
-        if total[place] < best:
-            best, division = float(total[place]), nearer[place]
-        if (nearer == member).all():
-            break
-        member = nearer
-    return division
+    Two groups that differ lie at the two ends.
+    """
+    values, axes = np.linalg.eigh(S.sum(axis=0))
+    whitening = axes / np.sqrt(np.maximum(values, ABSORBED * values[-1]) + NOTHING)
+    asked = g @ whitening
+    direction = whitening @ np.linalg.eigh(asked.T @ asked)[1][:, -1]
+    change = g @ direction / np.maximum(direction @ S @ direction, NOTHING)
+    return np.argsort(np.argsort(change, kind="stable"))

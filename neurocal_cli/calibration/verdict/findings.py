@@ -36,10 +36,14 @@ TOLD = (2 * LEVEL) ** 0.5
 """The same in standard deviations: from so many on, a difference is more than chance."""
 EXPLAINED = 0.5
 """Least share of the squared error beyond chance that causes explain if they are named."""
+DETERMINE = 3
+"""Views that determine a camera of their own, or tell bends of a target; more can contradict each other."""
 FEW_POINTS = 12
 """Fewest points that tell the size of their noise, to a fifth."""
 EXACT = 1e-4
 """Of the pixels' spread: an rms error this small is negligible."""
+ROUNDED = 1e-5
+"""The same, 0.01 px of 12 Mpx: that of rounded numbers, which has no cause."""
 MISFIT = 0.05  # of the pixels' spread: an rms error this large is neither noise nor distortion
 _SHOWN = 3
 # Equations beyond the unknowns from which 95 % lie within 1.4 and within 1.2 times two standard deviations
@@ -153,6 +157,17 @@ def two_digits(value: float) -> str:
     ('0.12', '230')
     """
     return f"{float(f'{value:.2g}'):.15g}"
+
+
+def percent(share: float) -> str:
+    """Write a share in percent with two significant digits.
+
+    Examples
+    --------
+    >>> percent(0.0123), percent(1.234)
+    ('1.2 %', '120 %')
+    """
+    return f"{two_digits(100 * share)} %"
 
 
 def name_some(names: Iterable[object]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,8 @@ _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly 
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 # Of all views (test_mistakes.py).
-_FEWEST_POINTS, _ENOUGH_VIEWS = 6, 40
+FEWEST_POINTS, ENOUGH_VIEWS = 6, 40
+"""Points of a view, and views, that tell a mistake in all of them."""
 _MAPPED = 0.03  # rms error of a homography over the spread of the pixels; lenses leave less
 _BETTER = 5.0  # times smaller than the error with the rows as given
 
@@ -160,12 +162,12 @@ MISTAKES: tuple[Mistake[Correspondences], ...] = (
 
 def mistake_in_all_views(points: Correspondences) -> tuple[str, str] | None:
     """The mistake that keeps a homography from mapping the target to each view, and what to do; or None."""
-    points = points.of_few_views(_ENOUGH_VIEWS)
+    points = points.of_few_views(ENOUGH_VIEWS)
     axes = np.flatnonzero(np.ptp(points.world, axis=0))
     if len(axes) != 2:
         return None
     members = [points.view_index == view for view in range(points.n_views)]
-    members = [rows for rows in members if np.count_nonzero(rows) >= _FEWEST_POINTS]
+    members = [rows for rows in members if np.count_nonzero(rows) >= FEWEST_POINTS]
 
     def misfit(world: Array) -> float:
         """Median over the views of the rms error of a homography over the spread of the pixels."""
@@ -199,7 +201,7 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     turned image or one of another size looks nearly like the same target in another pose, and a bend of the
     board takes in the rest.
     """
-    if not arrange(points).nearly_flat.all() or len(points) < 6:
+    if not arrange(points).nearly_flat.all() or len(points) < FEWEST_POINTS:
         return otherwise
     limit, plain = _HOLDS * rmse_px, located(points, camera)
     mistakes = [
@@ -248,9 +250,13 @@ def error_of_view(points: Correspondences, camera: Camera) -> float:
 
 def located(points: Correspondences, camera: Camera) -> Solution | None:
     """The view's pose with the camera; None if it cannot be estimated."""
+    return solved(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
+
+
+def solved(points: Correspondences, type: int, **given: Any) -> Solution | None:
+    """The solution of `problem_for` points that may be wrong; None if there is none."""
     try:
-        problem = problem_for(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
-        return fit(problem, options_for("lm", _STARTS, 0))
+        return fit(problem_for(points, type, **given), options_for("lm", _STARTS, 0))
     except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
         return None
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from neurocal_cli.adjustment.common_noise import common_share, measured
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.verdict.findings import (
     CORRELATED,
     EXACT,
@@ -42,7 +43,7 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
     u, v = np.sqrt((residuals**2).mean(axis=0))
     least = EXACT * pixel_spread(points)
     if max(u, v) > max(_ONE_WAY * min(u, v), least):
-        ratio, (most, other) = max(u, v) / max(min(u, v), 1e-12), ("u", "v") if u > v else ("v", "u")
+        ratio, (most, other) = max(u, v) / max(min(u, v), NOTHING), ("u", "v") if u > v else ("v", "u")
         yield (
             1,
             f"the residuals along {most} are {ratio:.2g} times those along {other}, as with motion blur",
@@ -101,7 +102,7 @@ def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[
     if n < FEW_POINTS:
         return
     squared = (residuals**2).sum(axis=1) / sigma**2
-    ratio = float(squared[few].mean() / max(squared[~few].mean(), 1e-300))
+    ratio = float(squared[few].mean() / max(squared[~few].mean(), NOTHING))
     if ratio > _FACTOR**2:
         yield (
             1,

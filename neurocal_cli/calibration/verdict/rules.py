@@ -24,6 +24,7 @@ from neurocal_cli.calibration.verdict.findings import (
     ERROR,
     EXACT,
     LEVEL,
+    ROUNDED,
     SHARE,
     SPARE,
     STRETCHED_PRINT,
@@ -33,6 +34,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Limit,
     image_diagonal,
     name_some,
+    percent,
     pixel_spread,
     two_digits,
     verdict_of,
@@ -154,7 +156,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "check that all views are of one camera at one zoom and focus, that the target has the true "
             "shape, and that given parameters are right",
         )
-    if e.rmse_px > 1e-6 * spread:
+    if e.rmse_px > ROUNDED * spread:
         # Too few data make the standard deviations large, which are judged by themselves.
         yield (
             int(e.held_out_px > ELSEWHERE.good * e.rmse_px),
@@ -263,12 +265,12 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     more = "add views in which the target is near, tilted and fills the image"
     if "alpha_u" not in fixed:
         share = calibration.relative_std_of_scale
-        yield SHARE.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
+        yield SHARE.grade(share), f"the std of the focal length is {percent(share)} of its value", more
     off_centre = list(_off_centre(calibration))
     if e.coverage.relief < _SHALLOW and (off_centre or calibration.relative_std_of_scale > SHARE.good):
         yield (
             1,
-            f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
+            f"the target is only {percent(e.coverage.relief)} as deep as it is far away: too shallow to "
             "determine the focal length and the centre",
             "use a deeper target, or several views of it from different angles",
         )
@@ -340,7 +342,7 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
         )
     yield (
         STRETCHED_PRINT.grade(abs(stretch) - TOLD * target.std_of_sides()),
-        f"the target is {100 * np.expm1(abs(stretch)):.2g} % longer along {longer}, compared with {other}, "
+        f"the target is {percent(np.expm1(abs(stretch)))} longer along {longer}, compared with {other}, "
         f"than described: {WRONG_PRINT}",
         measure,
     )

@@ -31,9 +31,16 @@ from neurocal_cli.adjustment.residual_correlation import correlation, effective_
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.verdict.findings import CONTRADICTION, EXPLAINED, LEVEL, Finding, log_odds
+from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
+    DETERMINE,
+    EXPLAINED,
+    LEVEL,
+    Finding,
+    log_odds,
+)
 from neurocal_cli.calibration.verdict.linearised import Board
+from neurocal_cli.calibration.verdict.mistakes import ENOUGH_VIEWS, FEWEST_POINTS, solved
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import causes_among
 from neurocal_cli.calibration.verdict.rivals import CHANGED, SAME, SHAPES
@@ -42,12 +49,10 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.homographies import homographies
 from neurocal_cli.camera.pinhole import omega_of, product_of
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.errors import NeurocalError
-from neurocal_cli.network.options import options_for
 from neurocal_cli.observations.points import Correspondences
 
 _TANGENTIAL = frozenset({"p1", "p2"})
-_DISPLACED = "k1k2"  # the model instead of a rich lens
+_DISPLACED = "k1k2"  # the model instead of a rich lens, and that of boards with unlike axes
 _Fit = tuple[Problem, Adjusted]
 
 
@@ -123,8 +128,6 @@ def _with_lens(plain: _Fit, kept: _Fit, free: _Fit, worth: float) -> tuple[_Fit,
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
-_FEWEST_VIEWS, _FEWEST_POINTS = 4, 6  # one view more than the unknowns need
-_ENOUGH_VIEWS, _STARTS = 40, 20
 _AWAY = 0.02  # least difference from 1; prints are less off, and boards of such small errors fit
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 _MEASURE = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
@@ -149,7 +152,7 @@ def proportions(points: Correspondences) -> Proportions | None:
     axes = _axes(points)
     if axes is None:
         return None
-    points = points.of_few_views(_ENOUGH_VIEWS)
+    points = points.of_few_views(ENOUGH_VIEWS)
     s = _linear(points, axes)
     found = None if s is None else _fitted(points, axes[0], s)
     if s is None or found is None:
@@ -192,7 +195,7 @@ def _axes(points: Correspondences) -> tuple[int, int] | None:
     order = np.argsort(extent)
     if not (extent[order[0]] <= _FLAT * extent[order[1]] and extent[order[1]] > 0):
         return None
-    if points.n_views < _FEWEST_VIEWS or np.bincount(points.view_index).min() < _FEWEST_POINTS:
+    if points.n_views <= DETERMINE or np.bincount(points.view_index).min() < FEWEST_POINTS:
         return None
     first, second = sorted(order[1:].tolist())
     extents = np.array([np.ptp(world[:, [first, second]], axis=0) for world in worlds_by_view(points)])
@@ -220,12 +223,7 @@ def _fitted(points: Correspondences, axis: int, s: float, skew: bool = True) -> 
     """The camera for points with an axis multiplied by s, with or without skew; None if there is none."""
     world = points.world.copy()
     world[:, axis] *= s
-    try:
-        points = replace(points, world=world)
-        problem = problem_for(points, 1, skew=skew, distortion=Distortion("k1k2"))
-        return fit(problem, options_for("lm", _STARTS, 0))
-    except NeurocalError:
-        return None
+    return solved(replace(points, world=world), 1, skew=skew, distortion=Distortion(_DISPLACED))
 
 
 def _refined(found: Solution, axes: tuple[int, int]) -> float:

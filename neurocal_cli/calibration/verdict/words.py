@@ -10,11 +10,13 @@ from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import (
+    DETERMINE,
     STRETCHED_PRINT,
     WRONG_PRINT,
     Said,
     in_sequence,
     name_some,
+    percent,
 )
 from neurocal_cli.calibration.verdict.rival import Say, Told
 from neurocal_cli.camera.geometry import Array
@@ -22,8 +24,6 @@ from neurocal_cli.camera.geometry import Array
 NEAR = 0.02
 """Of the focal length: two cameras are equal up to this."""
 _TURNED = 0.3  # of the distance of two centres: how far their mean may be from the middle of the image
-DETERMINE = 3
-"""Views that determine a camera of their own."""
 _SOME = 0.15  # share of the largest change of a given value from which on others are told, too
 
 
@@ -37,7 +37,7 @@ def changing(what: str) -> Say:
 
     def say(told: Told) -> Said:
         amount, pattern = float(told.found.amounts[0]), told.found.pattern
-        by = f"{what} {'grows' if amount > 0 else 'shrinks'} by {100 * abs(amount):.2g} %"
+        by = f"{what} {'grows' if amount > 0 else 'shrinks'} by {percent(abs(amount))}"
         turned = "the target changes its shape as it is turned, or the lens gives way"
         wide = told.lin.state.distortion.wide
         rays = ", or the rays of this wide lens do not meet in one point" if wide else ""
@@ -62,8 +62,8 @@ def changing(what: str) -> Say:
 def zooming(told: Told) -> Said:
     """A focal length of each view's own."""
     size = float(np.ptp(told.found.amounts))
-    by = f"{100 * size:.2g} %"
-    return f"the focal length changes from view to view, by {by} in all: the zoom or the focus moved", size
+    by = f"by {percent(size)} in all"
+    return f"the focal length changes from view to view, {by}: the zoom or the focus moved", size
 
 
 def stabilised(told: Told) -> Said:
@@ -139,7 +139,7 @@ def _alternative(first: Array, second: Array, middle: Array, exchanged: bool) ->
 def two_targets(told: Told) -> Said:
     """A target that is stretched in a group of views."""
     by, lean = told.found.amounts.tolist()
-    shape = f"longer by {100 * by:.2g} %" if abs(by) > abs(lean) else f"leaning by {lean:.2g} rad"
+    shape = f"longer by {percent(by)}" if abs(by) > abs(lean) else f"leaning by {lean:.2g} rad"
     return f"{name_some(told.members)}: a target of another shape than in the others, {shape}", max(
         abs(by), abs(lean)
     )
@@ -168,7 +168,7 @@ def stretched(told: Told) -> Said:
     longer, other = ("XYZ"[int(np.argmax(np.abs(axis)))] for axis in told.lin.board.axes.T[:2])
     if by < 0:
         longer, other = other, longer
-    shape = f"longer by {100 * abs(by):.2g} % along {longer}, compared with {other}"
+    shape = f"longer by {percent(abs(by))} along {longer}, compared with {other}"
     if abs(lean) > abs(by):
         shape = f"printed with sides that are {abs(lean):.2g} rad off a right angle"
     reason, size = _on_board(told, shape)
@@ -183,7 +183,7 @@ def deformed(told: Told) -> Said:
     strain = np.einsum("k,kij->ij", told.found.amounts, SOLID_STRETCHES)
     sides, (a, b) = np.diagonal(strain), divmod(int(np.abs(np.triu(strain, 1)).argmax()), 3)
     longer, other = int(sides.argmax()), int(sides.argmin())
-    shape = f"longer by {100 * np.ptp(sides):.2g} % along {'XYZ'[longer]}, compared with {'XYZ'[other]}"
+    shape = f"longer by {percent(np.ptp(sides))} along {'XYZ'[longer]}, compared with {'XYZ'[other]}"
     if 2 * abs(strain[a, b]) > np.ptp(sides):
         shape = f"with {'XYZ'[a]} and {'XYZ'[b]} off a right angle by {2 * abs(strain[a, b]):.2g} rad"
     return _on_board(told, f"a target of another shape, {shape}", "target")
@@ -191,7 +191,7 @@ def deformed(told: Told) -> Said:
 
 def _on_board(told: Told, shape: str, where: str = "board") -> Said:
     off = told.longer
-    makes = f"makes the focal length {100 * abs(off):.2g} % too {'short' if off > 0 else 'long'}"
+    makes = f"makes the focal length {percent(abs(off))} too {'short' if off > 0 else 'long'}"
     return f"the residuals repeat on the {where} in all views: it seems {shape}, which {makes}", abs(off)
 
 
@@ -234,8 +234,8 @@ def too_simple(model: str) -> Say:
             by = told.found.camera[np.searchsorted(told.lin.free, (3, 4))]
             moved = float(np.linalg.norm(by)) * told.lin.views.pixel_scale
         return (
-            f"the distortion model is too simple: {model} lowers the error by {100 * (1 - left):.2g} %, "
-            f"makes the focal length {100 * abs(longer):.2g} % {'longer' if longer > 0 else 'shorter'}, and "
+            f"the distortion model is too simple: {model} lowers the error by {percent(1 - left)}, "
+            f"makes the focal length {percent(abs(longer))} {'longer' if longer > 0 else 'shorter'}, and "
             f"moves the image centre by {moved:.2g} px",
             told.displaced / told.diagonal,
         )

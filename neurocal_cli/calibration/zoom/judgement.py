@@ -24,6 +24,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Said,
     likeliest,
     log_odds,
+    percent,
     verdict_of,
 )
 from neurocal_cli.calibration.zoom.parameter_networks import local_to_outputs, odd_camera
@@ -46,7 +47,7 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
     share = float((everywhere.std[:, :2] / everywhere.local[:, :2]).max())
     uncertain = (
         SHARE.grade(share),
-        f"the std of the focal length is up to {100 * share:.2g} % of its value between the settings",
+        f"the std of the focal length is up to {percent(share)} of its value between the settings",
         _MORE_CAMERAS if lens.known else "add settings where the parameters change most, and points",
     )
     measures = {"alpha_share": share}
@@ -55,7 +56,7 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
         return verdict_of(findings, measures)
     floor = lens.noise_floor_px
     elsewhere = (
-        ELSEWHERE.grade(elsewhere_px / max(floor, 1e-9)),
+        ELSEWHERE.grade(elsewhere_px / max(floor, _EXACT)),
         f"the error at the given points is {elsewhere_px:.3g} px, but the noise floor {floor:.3g} px",
         "check that target and camera are where they were, the unit of X,Y,Z and the names of the settings, "
         "or add settings where the parameters change most",
@@ -86,7 +87,7 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
     floor = lens.noise_floor_px
     if not any(grade for grade, *_ in causes):
         yield (
-            ELSEWHERE.grade(lens.left_out_px / max(floor, 1e-9)),
+            ELSEWHERE.grade(lens.left_out_px / max(floor, _EXACT)),
             f"the error at settings left out is {lens.left_out_px:.3g} px, but the noise floor "
             f"{floor:.3g} px, so the lens changes too much between the settings",
             "add settings where the parameters change most",
@@ -178,7 +179,7 @@ def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Findin
     share = float((everywhere.std[:, 2:4] / everywhere.local[:, :1]).max())
     yield (
         SHARE.grade(share),
-        f"the std of the image centre is up to {100 * share:.2g} % of the focal length between the settings",
+        f"the std of the image centre is up to {percent(share)} of the focal length between the settings",
         _MORE_CAMERAS,
     )
 
