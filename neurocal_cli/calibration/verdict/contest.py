@@ -116,8 +116,10 @@ def contest(
         if all(one.pattern == "all" for one in held.causes):
             return held
         lin = at_minimum(field, another_lens)
-        if estimates(lin, held.n, (ANOTHER_LENS,), held.causes[0].evidence):
-            held = _held(lin, worth, (*RIVALS, ANOTHER_LENS))
+        first = held.causes[0]
+        between = first.pattern != "all" and not first.rival.of_board
+        if between and estimates(lin, held.n, (ANOTHER_LENS,), first.evidence + LEVEL):
+            held = _held(lin, worth, (ANOTHER_LENS,))  # what it leaves of other causes would be guessed
         smooth, beside = estimates(lin, held.n, (NEIGHBOURS,)), lin
         for one in held.causes:
             beside = including(beside, one)
@@ -125,7 +127,7 @@ def contest(
         found = [*held.causes, *estimates(beside, held.n, (NEIGHBOURS,), 0.0)[:1]]
         if not smooth or sum(max(one.evidence, 0.0) for one in found) > smooth[0].evidence + LEVEL:
             return held
-        of_all = tuple(rival for rival in (*RIVALS, ANOTHER_LENS) if rival.patterns is common)
+        of_all = tuple(rival for rival in RIVALS if rival.patterns is common)
         return _held(including(lin, smooth[0]), worth, of_all)
     except np.linalg.LinAlgError:
         return None
