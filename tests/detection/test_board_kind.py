@@ -68,6 +68,12 @@ def test_boards_with_markers_are_found(form: str, legacy: bool, first_id: int) -
         assert plane.markers.side == pytest.approx(true.markers.side / true.square, abs=1e-6)
 
 
+def test_the_side_of_the_markers_is_told_by_one_between_four_vertices() -> None:
+    found = board_in("charuco:3x5:30:22:DICT_6X6_250", square=40.0)
+    assert found.plane.markers is not None
+    assert found.plane.markers.side == pytest.approx(22 / 30, abs=0.004)  # 0.7
+
+
 @pytest.mark.parametrize("form", ["asymmetric_circles:4x7:20:16", "circles:7x6:20:12"])
 def test_grids_of_circles_are_found(form: str) -> None:
     found = board_in(form, square=18.0 if "asym" in form else 26.0)

@@ -232,14 +232,13 @@ _USUAL, _SIMPLE = 20, 12  # denominators of usual ratios, and the largest one of
 # Differences from a usual ratio of a measured spacing, and of a marker's side: without blur, by the blur, and
 # at most.
 _CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.012
-_CLOSE_ROUGH = 0.03  # of one from the corners of the markers
+_CLOSE_ROUGH = 0.015  # of one from the corners of the markers
 _DIGITS = 3  # of other ratios
 _SHRUNK = (1.0, 0.96, 0.92, 0.88, 0.84, 0.8)  # sides of tags that are tried, over those that were read
 _LEAST = 0.04  # spacing
 _ALONG = np.linspace(0.35, 0.65, 7)  # of a cell's side, where the light is looked at
 _ACROSS = np.linspace(-0.15, 0.5, 53)  # of a cell, from its side inwards
 _BORDER = 0.6  # of the width of a marker's border that is looked at
-_FEWEST_MEASURED = 2  # cells
 
 # A picture of a board: its vertices (rows, cols, 2) [px], NaN where none was found, the first vertices (N, 2)
 # of the cells with markers, and the light.
@@ -369,7 +368,7 @@ def _side(picture: _Picture, rough: float, border: float) -> tuple[float, float]
     c, r = inner.T
     corners = np.stack([pixels[r, c], pixels[r, c + 1], pixels[r + 1, c + 1], pixels[r + 1, c]], axis=1)
     corners = corners[np.isfinite(corners).all(axis=(1, 2))]
-    if len(corners) < _FEWEST_MEASURED:
+    if not len(corners):
         return np.nan, np.nan
     sides = np.concatenate([np.roll(corners, turn, axis=1) for turn in range(4)])
     unit = np.broadcast_to(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), sides.shape)
