@@ -30,6 +30,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
@@ -273,7 +274,8 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     rmse = np.sqrt(there.normal.cost / start.data.counts)
     # The linearisation fails for a member now and then, so the median counts.
     squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
-    left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
+    counts = np.where(is_inside(x), start.data.counts, 0)
+    left_out = float(np.sqrt((squares * counts).sum() / counts.sum()))
     free_pose = float(np.sqrt(2 * free_pose_variance(start)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
     return replace(finished, warnings=_warnings(finished, start))
@@ -343,6 +345,16 @@ def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Arr
     normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
     return np.sqrt(np.maximum(squares, 0.0) / start.data.counts), np.maximum(normalised, 0.0)
+
+
+def is_inside(x: Array) -> NDArray[np.bool_]:
+    """(S,) which settings (S, D) no control has at an end of its range; all if that is none.
+
+    A control of two values has no inside. At an end, the other settings can only extrapolate.
+    """
+    ends = (x == x.min(axis=0)) | (x == x.max(axis=0))
+    inside = ~(ends & [len(np.unique(column)) > 2 for column in x.T]).any(axis=1)
+    return inside if inside.any() else ~inside
 
 
 def most_suspect(pixels: Array, normalised: Array) -> int | None:

@@ -46,8 +46,8 @@ _LARGEST_TILT = 0.99
 # test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
 _FLAT = 1e-4  # of free weights: a standard deviation of 100
 _MOST = 1e4
-_LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
-_ENOUGH_VALUES = 4
+_LEAST, _LEAST_FEW, _LEAST_SPARSE, _LEAST_TILT = 0.03, 0.3, 1.0, 1.0
+_FEW_VALUES, _ENOUGH_VALUES = 4, 4
 # The descent has no criterion to stop: the priors are updated until the schedule ends.
 _OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
@@ -315,13 +315,16 @@ def updated_precision(
     """Precision of each prior (..., G) by MacKay's formula, half the way to it on a logarithmic scale.
 
     `leverage` (..., P) is the diagonal of A^-1. Data do not shrink weights along directions that they do not
-    determine. The standard deviation of a prior is therefore at most 6. It is at most 1 for weights from a
-    control of three values, where a unit could turn between two of them without any effect on the data, and
-    for the weights a of the rational units, as tanh(a) saturates. It is exactly 1 for a where a control has
-    three values, as these leave the tilt open.
+    determine. The standard deviation of a prior is therefore at most 6. It is at most 1.8 for those of tanh
+    units where no control has more than four values: so few lie on the bend of one large unit by chance, and
+    it overshoots between them. It is at most 1 for weights from a control of three values, where a unit could
+    turn between two of them without any effect on the data, and for the weights a of the rational units, as
+    tanh(a) saturates. It is exactly 1 for a where a control has three values, as these leave the tilt open.
     """
     kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
     least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
+    if max(len(np.unique(column)) for column in x.T) <= _FEW_VALUES:
+        least[: 5 + D] = _LEAST_FEW
     least[2 : 2 + D][sparse] = _LEAST_SPARSE
     least[6 + D] = _LEAST_TILT
     if sparse.any():

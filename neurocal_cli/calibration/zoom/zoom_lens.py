@@ -66,7 +66,8 @@ class ZoomLens(Summarised):
         Reprojection error at each setting; nan for known cameras.
     rejected : tuple of RejectedSetting
     left_out_px : float
-        Cross-validation error, each setting predicted from all others; nan where unknown.
+        Cross-validation error: each setting that is not at an end of a control, predicted from all others;
+        nan where unknown.
     training : str
     seed : int
     converged : bool

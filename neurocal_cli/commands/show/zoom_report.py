@@ -69,7 +69,7 @@ def lens_words(lens: ZoomLens) -> tuple[str, list[str]]:
         f"errors of the cameras, estimated: {_camera_errors(lens)}"
         if lens.known
         else f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {lens.noise_floor_px:.3f} px; "
-        f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
+        f"cross-validation error, each setting but the outermost left out in turn: {lens.left_out_px:.3f} px"
     )
     scale = _SCALES[lens.members[0].nets.scale]
     training = _TRAININGS.get(lens.training, lens.training)

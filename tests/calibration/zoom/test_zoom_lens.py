@@ -543,6 +543,21 @@ def test_networks_beat_every_baseline_between_45_settings(bends: bool) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("law", ["a", "b", "c", "d", "e"])
+def test_networks_are_not_behind_between_16_settings(law: str) -> None:
+    """Means over two seeds."""
+    errors = []
+    for seed in (0, 1):
+        lens = fit_lens(seen(law, grid(4, 4), seed), distortion="none")
+        found = evaluate_lens(lens, seen(law, between(4, 4), 1000 + seed))
+        errors.append(
+            [found.rmse_px, *(found.baselines[f"{name}_joint"] for name in ("spline", "thin_plate"))]
+        )
+    networks, *others = np.mean(errors, axis=0)
+    assert networks < 1.02 * min(others)
+
+
+@pytest.mark.slow
 def test_networks_beat_splines_where_tanh_of_zoom_and_focus_are_multiplied() -> None:
     lens = fit_lens(seen("e", grid(9, 5), seed=0), distortion="none")
     evaluation = evaluate_lens(lens, seen("e", between(9, 5), seed=1000))

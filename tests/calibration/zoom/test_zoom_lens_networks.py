@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.zoom_laws import grid, seen
+from support.zoom_laws import HIGH, LOW, grid, seen, truth
 
 from neurocal_cli.calibration.zoom.initialisation import (
     calibrate_each,
@@ -16,7 +16,7 @@ from neurocal_cli.calibration.zoom.initialisation import (
     first_constants,
     local_covariance,
 )
-from neurocal_cli.calibration.zoom.joint_training import JointLearner, take_turns, train_joint
+from neurocal_cli.calibration.zoom.joint_training import JointLearner, is_inside, take_turns, train_joint
 from neurocal_cli.calibration.zoom.mlfn import Schedule, Topology, respond, respond_with_jacobian, train
 from neurocal_cli.calibration.zoom.parameter_networks import (
     SCALES,
@@ -176,6 +176,30 @@ def test_evidence_prefers_a_plane_where_there_is_one() -> None:
     error = respond(net, best, between)[0] - between @ [1.0, -0.5]
     assert np.sqrt((error**2).mean()) < 0.01  # the prior leaves hardly any of the six units
     assert np.sqrt(((respond(plane, simple.weights, between)[0] - between @ [1.0, -0.5]) ** 2).mean()) < 0.01
+
+
+def test_no_large_unit_passes_through_four_values_and_overshoots() -> None:
+    """The pupil of law D at 4 x 4 settings, between which a cubic errs by 0.28 of the spread."""
+    z, f = (axis.ravel() for axis in np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4)))
+    at, near = (axis.ravel() for axis in np.meshgrid([-2 / 3, 0.0, 2 / 3], [-2 / 3, 0.0, 2 / 3]))
+
+    def pupil(zoom: Array, focus: Array) -> Array:
+        shift = truth("d", LOW + 0.5 * (1 + np.column_stack([zoom, focus])) * (HIGH - LOW))["t_z"]
+        return (shift - 1450) / 12
+
+    topology = Topology(2, 2, 0, rich=False)
+    start = topology.random_weights(6, np.random.default_rng(0))
+    trained = train(topology, np.column_stack([z, f]), pupil(z, f), np.full(16, 1e-6), start)
+    best = trained.weights[[int(trained.evidence.argmax())]]
+    error = respond(topology, best, np.column_stack([at, near]))[0] - pupil(at, near)
+    assert np.sqrt((error**2).mean()) < 0.2
+
+
+def test_the_outermost_settings_do_not_count_as_left_out() -> None:
+    shares = 2 * (grid(4, 4) - LOW) / (HIGH - LOW) - 1
+    assert np.flatnonzero(is_inside(shares)).tolist() == [5, 6, 9, 10]
+    assert np.flatnonzero(is_inside(shares[:8])).tolist() == [1, 2, 5, 6]  # two zooms have no inside
+    assert is_inside(shares[[0, 3, 12, 15]]).all()
 
 
 def test_five_values_tell_close_focus() -> None:
