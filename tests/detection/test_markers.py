@@ -17,9 +17,13 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
+from neurocal_cli.detection.markers.ink_fit import fit_with_ink
 from neurocal_cli.detection.markers.lattice import leave_out_strays, place
+from neurocal_cli.detection.markers.locate import locate
 from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.detection.wide_lens import Flattening, WideLens
 from neurocal_cli.errors import InputError
@@ -81,13 +85,23 @@ def test_blurred_markers_near_the_edges_do_not_move_them() -> None:
 
 
 def test_ink_that_is_blurred_into_the_edges_does_not_shift_them() -> None:
-    """Codes of 5 x 5 bits, 1.5 sigma from the edges; with their shift in the ink, the error was 0.022 px."""
+    """Codes of 5 x 5 bits, 1.5 sigma from the edges."""
     scene = marked_scene(plane_of("charuco:8x6:28:21:DICT_5X5_100"), 811, square=36.0, psf=2.0)
     picture = taken(scene, 811, 4)
     error, squared = errors_of(detect_points(picture.image, scene.board, "vertices"), picture)
     assert len(error) == 35
     assert np.sqrt((error**2).mean()) < 0.009
     assert squared.mean() < 1.3
+
+
+def test_codes_that_are_blurred_into_the_edges_leave_the_blur_and_the_noise_of_a_pixel() -> None:
+    scene = marked_scene(plane_of("charuco:10x8:28:21:DICT_5X5_100"), 2, 14.0, (240, 180))
+    image = taken(scene, 2).image
+    (located,) = locate(scene.board, image).located
+    assert located.ink is not None
+    fitted = fit_with_ink(image, located.grid, 1 / 12, located.ink)
+    assert upper_median(fitted.fit.values[:, BLUR]) == pytest.approx(scene.sigma_t, rel=0.03)
+    assert fitted.noise.edge == pytest.approx(scene.sensor.read_noise**2 + 1 / 12, rel=0.3)
 
 
 def test_the_legacy_pattern_is_told_from_the_image() -> None:

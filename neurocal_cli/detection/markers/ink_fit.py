@@ -1,6 +1,9 @@
 """Fit the edges of a board with markers: their ink is in the model, with what the last fit says of it.
 
 The first look comes from profiles across the edges, which include the border of the marker beside the edge.
+Codes that are blurred into these profiles make levels and blur wrong by a fifth, and later fits keep the
+levels. Then blur and levels come from all pixels around the edges: each blur gives the light of edges and
+codes, and the levels that suit it best.
 """
 
 from __future__ import annotations
@@ -13,10 +16,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import interpolate
-from neurocal_cli.detection.fitting.batched_newton import LEAST_BLUR
+from neurocal_cli.detection.fitting.batched_newton import BLUR, CONTRAST, LEAST_BLUR, MEAN, ProfileShape
 from neurocal_cli.detection.fitting.common_parameters import correlation
-from neurocal_cli.detection.fitting.edge_fit import usual_stride
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, REACH, edge_model, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.edge_profile import (
+    RESPONSE_TERMS,
     EdgeProfile,
     edge_profile,
     erf_and_density,
@@ -38,13 +42,18 @@ from neurocal_cli.detection.medians import upper_median
 _FIRST_MOST = 0.5
 _MOST: tuple[tuple[float, tuple[float, ...]], ...] = ((7.0, ()), (5.0, (0.5,)))
 _MOST_NEAR = (0.5, 1.0, 1.0)
+_ALL = 10.0  # more than any change
 _OFFSET_SIGMA = 0.05  # px, of an edge's offset from its profile
 _SIGMAS = np.geomspace(0.4, 6.0, 12)  # px, tried first
 _OFFSETS = np.linspace(-1.0, 1.0, 9)  # px, of an edge from the found vertices
 _FINER = np.geomspace(0.75, 1.33, 9)  # factors on the blur tried afterwards
 _INTERPOLATED = 1 / 6  # px^2, variance that linear interpolation adds to the blur
 _WIDEST = 10.0  # px; greatest distance from the edges at which sharpening is looked for
+_CODES_APART = 0.8  # sigma between a profile and the inner code, below which blur makes it a part of it
+# Factors on the blur for all pixels, in two rounds; profiles with codes have up to 1.3 times the blur.
+_BY_PIXELS = ((0.68, 0.82, 1.0), (0.96, 1.04))
 _PLACES = 13  # samples across an edge
+_ROOM = 1.6  # length of a profile beyond an edge, in distances of the pattern from it
 _TINY = 1e-9  # least variance of the samples of a profile
 _ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
 
@@ -66,10 +75,6 @@ def fit_with_ink(
     gap = ink.gap * look.clearance(ink)
     rounds = next((all_of for limit, all_of in _MOST if gap > limit), _MOST_NEAR)
     for most in rounds:
-        if rounds is _MOST_NEAR:
-            # Ink that is blurred into the edges cannot be told from a shift of them. With the shift of the
-            # last round, the ink would move the edges further in each round, by up to 0.3 px.
-            look = replace(look, shift=0.0)
         fitted = fit_again(with_ink(raw, ink, look, most), fitted)
         look = look.halfway_to(_look_of(fitted, ink))
     return fitted
@@ -102,15 +107,61 @@ def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Arr
         usual = upper_median(values[:, 2])
         sigmas, offsets = usual * _FINER, 0.3 * _OFFSETS
     sigma = float(np.sqrt(max(usual**2 - _INTERPOLATED, LEAST_BLUR**2)))
-    mean, contrast = values[:, 0], values[:, 1]
-    variance = np.ones(len(mean))
-    dark, light = (Levels(lines.middle, mean + sign * contrast, variance) for sign in (-1, 1))
-    shading = fit_shading(found.map.frame, dark, light)
     crossing, ones = _crossing(found.map, ink), np.ones(len(ink.cell))
     rho = (crossing[0].normal * crossing[1].normal).sum(axis=1)
     blur = np.stack([sigma * ones, sigma * ones, rho], axis=-1)
     look = Appearance(found.map, blur, float(found.shift[0]), np.zeros(2))
+    mean, contrast, shading = _levels(found.map, lines, values[:, 0], values[:, 1])
+    if ink.border and (ink.border - (_ROOM - 1) * ink.gap) * look.clearance(ink) < _CODES_APART:
+        edges = np.column_stack([offset, np.zeros(len(offset)), mean, contrast, sigma + 0 * offset])
+        look, edges, noise = _by_pixels(raw, ink, look, lines, edges, shading)
+        mean, contrast, shading = _levels(found.map, lines, edges[:, MEAN], edges[:, CONTRAST])
     return look, found, (mean, contrast), noise, shading
+
+
+def _levels(at: SmoothMap, lines: Lines, mean: Array, contrast: Array) -> tuple[Array, Array, Shading]:
+    """Mean levels and half contrasts of edges, and the shading through them."""
+    variance = np.ones(len(mean))
+    dark, light = (Levels(lines.middle, mean + sign * contrast, variance) for sign in (-1, 1))
+    return mean, contrast, fit_shading(at.frame, dark, light)
+
+
+def _by_pixels(
+    raw: GridImage, ink: Ink, look: Appearance, lines: Lines, edges: Array, shading: Shading
+) -> tuple[Appearance, Array, float]:
+    """Look with the blur that suits all pixels around the edges best, their values (E, 5), noise [DN^2].
+
+    Offset and levels of each edge follow from each blur by one step from the values known so far.
+    """
+    free = np.array([OFFSET, MEAN, CONTRAST]) % edges.shape[1]
+    shape = ProfileShape(np.zeros((len(edges), 2)), np.zeros(RESPONSE_TERMS))
+    usual, reach = upper_median(edges[:, BLUR]), REACH * edges[:, BLUR]
+
+    def tried(sigma: float) -> tuple[float, Appearance, Array]:
+        values = edges.copy()
+        values[:, BLUR] = sigma
+        blur = np.column_stack([np.full((len(ink.cell), 2), sigma), look.blur[:, 2]])
+        own = replace(look, blur=blur, shift=0.0)
+        pixels = edge_pixels(
+            with_ink(raw, ink, own, _ALL), lines, values[:, BLUR], shading, reach, usual_stride(lines)
+        )
+        products = edge_model(pixels, values, shape).products(edges.shape[1])
+        information, gradient = products[:, 1 + free[:, None], 1 + free], products[:, 1 + free, :1]
+        step = np.linalg.solve(information + _TINY * np.eye(len(free)), gradient)
+        values[:, free] += step[:, :, 0]
+        left = products[:, 0, 0] - (step * gradient).sum(axis=(1, 2))
+        count = np.count_nonzero(pixels.root, axis=1) - len(free)
+        return upper_median(left / np.maximum(count, 1)), own, values
+
+    known: dict[float, float] = {}
+    for factors in _BY_PIXELS:
+        known |= {usual * factor: tried(usual * factor)[0] for factor in factors}
+        nearest = sorted(known, key=known.__getitem__)[:3]
+        bend, slope, _ = np.polyfit(np.log(nearest), [known[one] for one in nearest], 2)
+        best = float(np.exp(-0.5 * slope / bend)) if bend > 0 else nearest[0]
+        usual = float(np.clip(best, min(nearest), max(nearest)))
+        known[usual], look, edges = tried(usual)
+    return look, edges, known[usual]
 
 
 def _noise(raw: GridImage, at: SmoothMap) -> float:
@@ -140,7 +191,7 @@ def _profiles(
     inside = raw.edges.centre + (share * side * raw.edges.light)[:, None] * across
     gap = np.abs(((at.at(inside) - lines.middle) * lines.normal).sum(axis=1))
     near = share < 0.5
-    room = np.minimum(np.where(near, 1.6 * gap, np.inf), 0.4 * lines.width)
+    room = np.minimum(np.where(near, _ROOM * gap, np.inf), 0.4 * lines.width)
     d = np.linspace(-1, 1, _PLACES) * room[:, None]
     image = np.asarray(raw.image, dtype=np.float32)
     seen = np.zeros(d.shape)
