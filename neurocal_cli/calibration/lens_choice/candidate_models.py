@@ -161,7 +161,7 @@ class _Chain:
             if candidate is None:
                 continue
             fitted[model] = candidate
-            if model != "none" and candidate.not_monotonic is None and candidate.cost <= least:
+            if model != "none" and candidate.not_monotonic != "points" and candidate.cost <= least:
                 state, least = candidate.adjusted.state, candidate.cost
         for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
             self._fit_again(simple, more, fitted)

@@ -80,6 +80,11 @@ def glass(seen: Seen) -> Array | None:
     return (seen.by_board[:, :2] * shift[:, :, None]).sum(axis=1, keepdims=True)
 
 
+def no_pupil(seen: Seen) -> Array:
+    """Rays that meet the axis of the lens elsewhere, the more they lean."""
+    return seen.by_lens[:, None]
+
+
 def turning(seen: Seen) -> Array:
     """The camera turns while the rows are read: the image moves."""
     return seen.by_entries[:, 3:5] * seen.pixels[:, None, None, 1]

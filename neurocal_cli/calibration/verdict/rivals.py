@@ -182,6 +182,18 @@ RIVALS: tuple[Rival, ...] = (
         effects.common,
         effect=effects.glass,
     ),
+    Rival(
+        "rays that do not meet in one point",
+        "residuals around the centre that are others for near targets than for far ones",
+        "photograph the target at the distances at which you measure",
+        words.plain(
+            "near and far targets do not fit one camera, by {px} px rms: the rays do not meet in one point, "
+            "as in a wide lens, or behind a flat window under water"
+        ),
+        DISPLACED,
+        effects.common,
+        effect=effects.no_pupil,
+    ),
     *(
         Rival(
             "a rolling shutter",

@@ -39,11 +39,9 @@ def changing(what: str) -> Say:
         amount, pattern = float(told.found.amounts[0]), told.found.pattern
         by = f"{what} {'grows' if amount > 0 else 'shrinks'} by {percent(abs(amount))}"
         turned = "the target changes its shape as it is turned, or the lens gives way"
-        wide = told.lin.state.distortion.wide
-        rays = ", or the rays of this wide lens do not meet in one point" if wide else ""
         how = {
             "line": "along the sequence of the views, so zoom or focus moves",
-            "distance": f"from the farthest to the nearest view, so the focus moves{rays}",
+            "distance": "from the farthest to the nearest view, so the focus moves",
             "tilt along u": f"from views of the target turned to the left to those to the right, so {turned}",
             "tilt along v": f"from views of the target turned upwards to downwards, so {turned}",
             "step": f"from view {told.members[0]} on, so zoom or focus has moved" if told.members else "",

@@ -15,11 +15,14 @@ from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.calibration.lens_choice import given_model
 from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit, where_not_monotonic
 from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
+from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.camera.monotonic import radial_slope
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.simulation.rigs import SimulatedRig
 
 LENSES = {
     "k1": [-0.2],
@@ -101,6 +104,23 @@ def test_points_that_deny_every_lens_without_a_fold_are_refused() -> None:
     points = noisy("k1k2", 130)
     with pytest.raises(DegenerateGeometryError, match=r"k1 is not monotonic .* inside the image"):
         calibrate(points, distortion="k1", skew=False)
+
+
+def test_points_near_the_fold_of_a_true_lens_do_not_make_it_a_pinhole() -> None:
+    """Corners beyond the image of 50 degrees from the axis, as of an endoscope, show nothing."""
+    rng = np.random.default_rng(2)
+    lens = Distortion("k1k2", np.array([-0.32, 0.04]))
+    camera = Camera(Intrinsics(675.0, 675.0, 637.0, 481.0), lens, (1280, 960))
+    board = np.array([(25.0 * x - 100, 25.0 * y - 75, 0.0) for y in range(7) for x in range(9)])
+    frames = {}
+    for name in "abcdefghijkl":
+        turn = np.append(rng.uniform(-0.7, 0.7, 2), rng.uniform(-1, 1))
+        t = np.append(rng.uniform(-130, 130, 2), rng.uniform(220, 400))
+        frames[name] = Pose(rotation_step(turn[None])[0], t)
+    seen = SimulatedRig({"cam": camera}, {"cam": Pose(np.eye(3), np.zeros(3))}, board, frames)
+    found = calibrate(seen.points(0.05, rng)["cam"])
+    assert found.rmse_px < 1.1 * 0.05 * np.sqrt(2)
+    assert found.intrinsics.alpha_u == pytest.approx(675.0, abs=5 * found.std["alpha_u"])
 
 
 def test_a_fisheye_need_not_see_the_corners() -> None:

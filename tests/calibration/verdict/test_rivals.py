@@ -17,6 +17,7 @@ from support.scenes import table_1
 from support.slow_cases import slow_but
 from support.targets import photographed as target_photographed
 from support.targets import stabilised
+from support.wide_scenes import wide_set
 from support.wrong_inputs import by_rolling_shutter, of_cameras
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
@@ -271,6 +272,21 @@ def test_a_plate_of_glass_is_told() -> None:
     noise = 0.05 * np.random.default_rng(1).standard_normal(pixels.shape)
     found = calibrate(replace(points, pixels=pixels + noise), target="given", distortion="none")
     assert "plate of glass" in reasons(found)
+
+
+@pytest.mark.parametrize(("seed", "shift"), slow_but([(1, 1.0)], [(1, 1.0), (3, 3.0)]))
+def test_rays_that_do_not_meet_in_one_point_are_told(seed: int, shift: float) -> None:
+    """The pupil of a fisheye that moves by some millimetres as rays lean."""
+    scene = wide_set(seed, "fisheye", field=150.0, n_views=20, sigma=0.1)
+    view, names = scene.points.view_index, scene.points.view_names
+    X = np.stack([scene.poses[names[k]].to_camera(x) for k, x in zip(view, scene.points.world, strict=True)])
+    seen = X.copy()
+    for _ in range(5):
+        seen[:, 2] = X[:, 2] - shift * np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]) ** 2
+    moved = scene.camera.project(seen)[0] - scene.camera.project(X)[0]
+    central, found = calibrate(scene.points), calibrate(displaced(scene.points, moved))
+    assert not reasons(central)
+    assert reasons(found).startswith("near and far targets do not fit one camera")
 
 
 def curled(by: float, seed: int, n: int = 14) -> Calibration:
