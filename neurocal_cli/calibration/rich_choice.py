@@ -75,7 +75,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     repeated = solution.repeated
     held = contest_of(problem, solution.adjusted, repeated.worth) if repeated.n_poses >= _FEWEST else None
     # What differs from view to view may be the lens: other parts of it are seen.
-    if held is None or (held.of_all_views and held.causes[0].rival not in RICHER_LENSES):
+    if held is None or (held.of_all_views and held.causes[0].rival.cause != RICHER_LENSES[0].cause):
         return None
     problem = problem.with_points(problem.points if target is None else target.as_given(problem.points))
     fisheye, adjusted = as_fisheye(problem, normalised(solution.in_pixels, problem.views))

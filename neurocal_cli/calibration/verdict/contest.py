@@ -292,7 +292,7 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
 
     `given_told` tells whether a wrong given value is named already, by the values that the points have.
     """
-    estimated = calibration.target is not None
+    estimated, small = calibration.target is not None, True
     for place, (found, close) in enumerate(zip(contest.causes, contest.close, strict=True)):
         if found.rival.of_given and (given_told or _is_uncertain(found, contest, calibration)):
             continue
@@ -318,6 +318,9 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
             grade = max(grade, int(not found.rival.of_given))
         if contest.of_outliers and not place:
             grade = max(grade, 1)  # points are left out because of it
+        if place and small and found.evidence < _UNCLEAR * LEVEL:
+            continue  # it may be what a cause leaves that is too small to be told
+        small = small and not grade
         yield grade, reason + or_else(names), found.rival.advice
 
 

@@ -24,6 +24,7 @@ BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 """Powers of x and y of a smooth bend; lower ones describe the plane."""
 _GLASS = 1.5  # its refractive index
 _RADIAL = (2, 3, 4)  # powers of r^2 of radial displacements, beyond those among `BENDS`
+_SQUEEZED = 0.1  # least difference of the focal lengths along u and v, relative
 
 
 def bends(seen: Seen) -> Array | None:
@@ -82,7 +83,17 @@ def glass(seen: Seen) -> Array | None:
 
 def no_pupil(seen: Seen) -> Array:
     """Rays that meet the axis of the lens elsewhere, the more they lean."""
-    return seen.by_lens[:, None]
+    r2 = ((seen.from_centre / seen.focal[:, None]) ** 2).sum(axis=1)
+    return (seen.by_depth * r2[:, None])[:, None]
+
+
+def squeezed(seen: Seen) -> Array | None:
+    """Distortion that is round in an image that a lens has squeezed, and not in the angles of the rays."""
+    if np.ptp(seen.focal) < _SQUEEZED * seen.focal.max():
+        return None
+    x, y = np.moveaxis(seen.from_centre, 1, 0)[:, :, None, None]
+    r2 = (x**2 + y**2)[:, :, 0]
+    return (x * seen.by_entries[:, 3, None] + y * seen.by_entries[:, 4, None]) * r2[:, :, None]
 
 
 def turning(seen: Seen) -> Array:

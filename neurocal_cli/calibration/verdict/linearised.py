@@ -68,9 +68,9 @@ class Seen:
     by_entries: Array  # (T, 5, 2, n) derivatives of the pixels by the entries of A
     pixels: Array  # (T, 2, n) where the camera sees the points, from the middle of the image; over S1
     observed: Array  # (T, 2, n) where they were observed [px]
-    # (T, 2, n) derivatives by a shift of the rays along the axis of the lens [world unit] that grows with the
-    # squared distance from the image centre, over S1.
-    by_lens: Array
+    by_depth: Array  # (T, 2, n) derivatives by a shift along the axis of the lens [world unit]
+    from_centre: Array  # (T, 2, n) the same places as `pixels`, from the image centre
+    focal: Array  # (2,) focal lengths along u and v, over S1
     # Derivatives (T, 3, 2, n) along the board, across it and along its normal, over its half length; the
     # places x, y (2, T, n) on it, over the same; and the directions (T, 3, n) to the camera along these axes.
     # They are None without a common flat board.
@@ -195,11 +195,9 @@ def _derivatives(
                 off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
             off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
-        leaning = ((observed - off - state.entries[0, 3:, None]) ** 2).sum(axis=1) / views.scale[view][
-            :, None
-        ]
-        by_lens = J[:, POSE][:, 5] * leaning[:, None]
-        seen = Seen(J[:, :5], observed - off - middle[:, None], px, by_lens)
+        by_depth = J[:, POSE][:, 5] / views.scale[view][:, None, None]
+        from_centre, focal = observed - off - state.entries[0, 3:, None], state.entries[0, [0, 2]]
+        seen = Seen(J[:, :5], observed - off - middle[:, None], px, by_depth, from_centre, focal)
         seen = _on_target(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}
         widths = {effect: part.shape[1] for effect, part in found.items()}

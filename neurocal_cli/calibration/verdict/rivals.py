@@ -194,6 +194,15 @@ RIVALS: tuple[Rival, ...] = (
         effects.common,
         effect=effects.no_pupil,
     ),
+    Rival(
+        RICHER_LENSES[0].cause,
+        "residuals that are round in the image, and not in the angles of the rays",
+        "give --distortion rich, with 20 views or more",
+        words.plain("the lens squeezes the image: its distortion differs along u and v, by {px} px rms"),
+        DISPLACED,
+        effects.common,
+        effect=effects.squeezed,
+    ),
     *(
         Rival(
             "a rolling shutter",

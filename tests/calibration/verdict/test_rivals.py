@@ -274,6 +274,17 @@ def test_a_plate_of_glass_is_told() -> None:
     assert "plate of glass" in reasons(found)
 
 
+def test_a_lens_that_squeezes_the_image_is_told() -> None:
+    points, truth = target_photographed("flat", 742, 14, sigma=0.1, k=(0.0, 0.0))
+    X = (truth.R[points.view_index] @ points.world[..., None])[..., 0] + truth.t[points.view_index]
+    squeezed = X[:, :2] / X[:, 2:] * [0.5, 1.0]
+    squeezed *= 1 - 0.2 * (squeezed**2).sum(axis=1, keepdims=True)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(squeezed.shape)
+    found = calibrate(replace(points, pixels=squeezed * truth.K[0, 0] + truth.K[:2, 2] + noise))
+    assert "the lens squeezes the image" in reasons(found)
+    assert "displaced" not in reasons(found)
+
+
 @pytest.mark.parametrize(("seed", "shift"), slow_but([(1, 1.0)], [(1, 1.0), (3, 3.0)]))
 def test_rays_that_do_not_meet_in_one_point_are_told(seed: int, shift: float) -> None:
     """The pupil of a fisheye that moves by some millimetres as rays lean."""
