@@ -13,47 +13,65 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.advice import advise
-    from neurocal_cli.calibration.calibrate import calibrate
-    from neurocal_cli.calibration.calibration import Calibration, Verdict
-    from neurocal_cli.calibration.drift import Drift, find_drift
-    from neurocal_cli.calibration.evaluation import evaluate_camera
-    from neurocal_cli.calibration.rig.advice import advise_rig
-    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig, calibrate_stereo, fit_stereo
-    from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
-    from neurocal_cli.calibration.rig.many_views import triangulate_many
-    from neurocal_cli.calibration.rig.rectification import rectify
-    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-    from neurocal_cli.calibration.rig.rig_drift import RigDrift, find_rig_drift
-    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
-    from neurocal_cli.calibration.rig.triangulation import triangulate
-    from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
-    from neurocal_cli.calibration.zoom.fit import fit_lens, fit_lens_cameras
-    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens, camera_at
-    from neurocal_cli.camera.camera import Camera
-    from neurocal_cli.camera.distortion import Distortion
-    from neurocal_cli.camera.pinhole import Intrinsics, Pose
-    from neurocal_cli.camera.remapping import undistort_image
-    from neurocal_cli.commands.show.results import plot, report
-    from neurocal_cli.detection.board_kind import find_board
-    from neurocal_cli.detection.detect import Detection, detect_points
-    from neurocal_cli.errors import NeurocalError
-    from neurocal_cli.files.board_yaml import read_board
-    from neurocal_cli.files.calibration_yaml import read_calibration
-    from neurocal_cli.files.images import read_image
-    from neurocal_cli.files.lens_files import read_lens, read_lens_data, read_lens_points, write_lens
-    from neurocal_cli.files.points_csv import read_points, write_points
-    from neurocal_cli.files.result_files import write_calibration, write_rig
-    from neurocal_cli.files.rig_points import read_rig_points
-    from neurocal_cli.files.rig_yaml import read_rig, read_stereo_rig
-    from neurocal_cli.observations.board import Board
-    from neurocal_cli.observations.points import Correspondences
-    from neurocal_cli.observations.target import Target
-    from neurocal_cli.observations.undistorted_points import undistort_points
+    from neurocal_cli.calibration.advice import advise as advise
+    from neurocal_cli.calibration.calibrate import calibrate as calibrate
+    from neurocal_cli.calibration.calibration import Calibration as Calibration
+    from neurocal_cli.calibration.calibration import Verdict as Verdict
+    from neurocal_cli.calibration.drift import Drift as Drift
+    from neurocal_cli.calibration.drift import find_drift as find_drift
+    from neurocal_cli.calibration.evaluation import evaluate_camera as evaluate_camera
+    from neurocal_cli.calibration.rig.advice import advise_rig as advise_rig
+    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig as calibrate_rig
+    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo as calibrate_stereo
+    from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo as fit_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_stereo as evaluate_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_stereo_rig as evaluate_stereo_rig
+    from neurocal_cli.calibration.rig.many_views import triangulate_many as triangulate_many
+    from neurocal_cli.calibration.rig.rectification import rectify as rectify
+    from neurocal_cli.calibration.rig.rig import Rig as Rig
+    from neurocal_cli.calibration.rig.rig import StereoRig as StereoRig
+    from neurocal_cli.calibration.rig.rig_drift import RigDrift as RigDrift
+    from neurocal_cli.calibration.rig.rig_drift import find_rig_drift as find_rig_drift
+    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig as evaluate_rig
+    from neurocal_cli.calibration.rig.triangulation import triangulate as triangulate
+    from neurocal_cli.calibration.zoom.evaluation import evaluate_lens as evaluate_lens
+    from neurocal_cli.calibration.zoom.fit import fit_lens as fit_lens
+    from neurocal_cli.calibration.zoom.fit import fit_lens_cameras as fit_lens_cameras
+    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens as ZoomLens
+    from neurocal_cli.calibration.zoom.zoom_lens import camera_at as camera_at
+    from neurocal_cli.camera.camera import Camera as Camera
+    from neurocal_cli.camera.distortion import Distortion as Distortion
+    from neurocal_cli.camera.pinhole import Intrinsics as Intrinsics
+    from neurocal_cli.camera.pinhole import Pose as Pose
+    from neurocal_cli.camera.remapping import undistort_image as undistort_image
+    from neurocal_cli.commands.show.results import plot as plot
+    from neurocal_cli.commands.show.results import report as report
+    from neurocal_cli.detection.board_kind import find_board as find_board
+    from neurocal_cli.detection.detect import Detection as Detection
+    from neurocal_cli.detection.detect import detect_points as detect_points
+    from neurocal_cli.errors import NeurocalError as NeurocalError
+    from neurocal_cli.files.board_yaml import read_board as read_board
+    from neurocal_cli.files.calibration_yaml import read_calibration as read_calibration
+    from neurocal_cli.files.images import read_image as read_image
+    from neurocal_cli.files.lens_files import read_lens as read_lens
+    from neurocal_cli.files.lens_files import read_lens_data as read_lens_data
+    from neurocal_cli.files.lens_files import read_lens_points as read_lens_points
+    from neurocal_cli.files.lens_files import write_lens as write_lens
+    from neurocal_cli.files.points_csv import read_points as read_points
+    from neurocal_cli.files.points_csv import write_points as write_points
+    from neurocal_cli.files.result_files import write_calibration as write_calibration
+    from neurocal_cli.files.result_files import write_rig as write_rig
+    from neurocal_cli.files.rig_points import read_rig_points as read_rig_points
+    from neurocal_cli.files.rig_yaml import read_rig as read_rig
+    from neurocal_cli.files.rig_yaml import read_stereo_rig as read_stereo_rig
+    from neurocal_cli.observations.board import Board as Board
+    from neurocal_cli.observations.points import Correspondences as Correspondences
+    from neurocal_cli.observations.target import Target as Target
+    from neurocal_cli.observations.undistorted_points import undistort_points as undistort_points
 
 __version__ = "0.1.0"
 
-# The modules of the names, in alphabetical order as below.
+# The public names and their modules.
 _HOMES = {
     "Board": "observations.board",
     "Calibration": "calibration.calibration",
@@ -112,63 +130,7 @@ _HOMES = {
     "write_rig": "files.result_files",
 }
 
-__all__ = [
-    "Board",
-    "Calibration",
-    "Camera",
-    "Correspondences",
-    "Detection",
-    "Distortion",
-    "Drift",
-    "Intrinsics",
-    "NeurocalError",
-    "Pose",
-    "Rig",
-    "RigDrift",
-    "StereoRig",
-    "Target",
-    "Verdict",
-    "ZoomLens",
-    "advise",
-    "advise_rig",
-    "calibrate",
-    "calibrate_rig",
-    "calibrate_stereo",
-    "camera_at",
-    "detect_points",
-    "evaluate_camera",
-    "evaluate_lens",
-    "evaluate_rig",
-    "evaluate_stereo",
-    "evaluate_stereo_rig",
-    "find_board",
-    "find_drift",
-    "find_rig_drift",
-    "fit_lens",
-    "fit_lens_cameras",
-    "fit_stereo",
-    "plot",
-    "read_board",
-    "read_calibration",
-    "read_image",
-    "read_lens",
-    "read_lens_data",
-    "read_lens_points",
-    "read_points",
-    "read_rig",
-    "read_rig_points",
-    "read_stereo_rig",
-    "rectify",
-    "report",
-    "triangulate",
-    "triangulate_many",
-    "undistort_image",
-    "undistort_points",
-    "write_calibration",
-    "write_lens",
-    "write_points",
-    "write_rig",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

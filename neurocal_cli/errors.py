@@ -52,10 +52,11 @@ class UsageError(NeurocalError):
     exit_code = 2
 
 
-def check_kind(name: str, value: object, kind: type, instead: str) -> None:
-    """Refuse an argument of another kind with an InputError, which says what to give instead."""
+def check_kind(name: str, value: object, kind: type | tuple[type, ...], instead: str) -> None:
+    """Refuse an argument of other kinds with an InputError, which says what to give instead."""
     if not isinstance(value, kind):
-        raise InputError(f"{name} must be a {kind.__name__}, not {type(value).__name__}; give {instead}")
+        kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
+        raise InputError(f"{name} must be a {kinds}, not {type(value).__name__}; give {instead}")
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES, image_points
 from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, UsageError, check_kind
 from neurocal_cli.observations.points import Correspondences
 
 _LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's mean direction
@@ -252,6 +252,7 @@ def problem_for(
     if square:
         fix = _both_alphas(fix or {}, type, skew)
     held: dict[str, float] = {}
+    check_kind("fix", fix or {}, Mapping, "a dict such as {'u0': 319.5}")
     for name, number in (fix or {}).items():
         _check_fixed(name, number, fixed, type, skew, distortion.model)
         fixed.add(name)

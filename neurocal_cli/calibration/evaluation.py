@@ -35,7 +35,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose, in_cameras
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, check_kind
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
@@ -108,6 +108,8 @@ def evaluate_camera(
     fit: Calibration | None = None
     seed = 0
     given = points
+    if given is not None:
+        check_kind("points", given, Correspondences, "what read_points made")
     if isinstance(calibration, Calibration):
         points = calibration.points if points is None else points
         if not len(points):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array, Shape
 from neurocal_cli.camera.undistortion import Undistorted, chosen_view, sources
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, check_kind
 
 Interpolation = Literal["nearest", "linear", "cubic", "lanczos"]
 INTERPOLATIONS = {
@@ -151,6 +151,7 @@ def undistort_image(
 
 def _size(image: NDArray[Any]) -> tuple[int, int]:
     """Width and height [px] of an image that OpenCV can interpolate."""
+    check_kind("an image", image, np.ndarray, "what read_image or cv2.imread made")
     flat = image.ndim == 2 or (image.ndim == 3 and 1 <= image.shape[2] <= _CHANNELS)
     if not flat or not image.size or image.dtype not in _TYPES:
         raise InputError(

@@ -296,4 +296,5 @@ def find_board(images: Iterable[NDArray[np.generic]], square: float = 1.0, unit:
     NoBoardError
         No image shows a board, or only parts, or the images do not agree; the message says what they show.
     """
+    images = [images] if isinstance(images, np.ndarray) and images.ndim < 3 else images
     return Board((found_board(images).plane.rescaled(square),), unit)

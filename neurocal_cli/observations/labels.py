@@ -30,6 +30,8 @@ def factorise(
         distinct, first, inverse = np.unique(labels[starts], return_index=True, return_inverse=True)
     except TypeError as error:
         raise InputError("the views' labels must be all text or all numbers") from error
+    if labels.dtype.kind in "fO" and {"nan", "None"} & {str(label) for label in distinct}:
+        raise InputError("some rows have no view; name the image of each, or leave the rows out")
     order = np.argsort(first, kind="stable")
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))

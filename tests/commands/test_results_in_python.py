@@ -12,6 +12,7 @@ from support.command_line import run
 from support.made_calibration import made_calibration
 from support.places import SAMPLES
 
+import neurocal
 from neurocal_cli import (
     Board,
     Calibration,
@@ -29,7 +30,7 @@ from neurocal_cli import (
     report,
     triangulate,
 )
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, NeurocalError, UsageError
 
 
 @cache
@@ -165,6 +166,53 @@ def test_arguments_of_another_kind_are_named_with_what_to_give() -> None:
         (lambda: calibrate("points.csv"), "points must be a Correspondences, not str"),
         (lambda: calibrate_stereo(points, "right.csv"), "points of right must be a Correspondences"),
         (lambda: triangulate(camera(), points.pixels, points.pixels), "pixels are missing; give a StereoRig"),
+        (lambda: calibrate(points, fix=["u0"]), "fix must be a Mapping, not list; give a dict"),
+        (
+            lambda: Correspondences(points.world, points.pixels, [None] * len(points)),
+            "some rows have no view",
+        ),
+        (lambda: Correspondences(points.world, points.pixels, [np.nan] * len(points)), "rows have no view"),
+        (lambda: neurocal.Distortion([0.1]), "a distortion model must be a str, not list"),
+        (lambda: neurocal.undistort_image("a.png", camera()), "image must be a ndarray, not str"),
+        (lambda: neurocal.evaluate_camera(camera(), points.pixels), "points must be a Correspondences"),
+        (lambda: neurocal.advise(rig()), "calibration must be a Calibration, not StereoRig"),
+        (lambda: neurocal.fit_stereo(points, points), "a camera must be a Calibration"),
+        (lambda: neurocal.calibrate_rig([points, points]), "points must be a Mapping, not list"),
+        (lambda: neurocal.rectify(camera()), "rig must be a StereoRig, not Calibration"),
+        (lambda: neurocal.evaluate_stereo_rig(camera()), "rig must be a StereoRig"),
+        (lambda: neurocal.evaluate_rig(camera()), "rig must be a Rig, not Calibration"),
+        (lambda: neurocal.find_rig_drift(rig(), camera()), "rig must be a Rig, not Calibration"),
+        (lambda: neurocal.triangulate_many(rig(), [0, 0.5], ["left", "right"], [[1, 2], [3, 4]]), "be whole"),
+        (lambda: neurocal.triangulate_many(rig(), [-1, 0], ["left", "right"], [[1, 2], [3, 4]]), "be whole"),
+        (lambda: neurocal.fit_lens(points), "points must be a LensPoints, not Correspondences"),
+        (lambda: neurocal.fit_lens_cameras({}), "cameras must be a LensCameras"),
+        (lambda: neurocal.camera_at(camera(), [1.0]), "lens must be a ZoomLens"),
+        (lambda: neurocal.evaluate_lens(camera(), points), "lens must be a ZoomLens"),
+        (lambda: neurocal.write_lens(camera(), "lens.yaml"), "lens must be a ZoomLens"),
+        (
+            lambda: neurocal.write_calibration("camera.yaml", camera()),
+            "not str; give what calibrate or calibrate_rig made, then the path",
+        ),
+        (lambda: neurocal.write_points(points.world, "points.csv"), "points must be a Correspondences"),
+        (lambda: plot(points), "result must be a Calibration or StereoRig or Rig or ZoomLens"),
+        (lambda: report(points), "result must be a Calibration or StereoRig or Rig or ZoomLens"),
     ):
         with pytest.raises(InputError, match=told):
             call()  # type: ignore[no-untyped-call]
+
+
+def test_a_rig_of_two_cameras_is_a_rig_of_any_number() -> None:
+    two = rig()
+    assert not neurocal.find_rig_drift(two, two).different
+    assert neurocal.advise_rig(two, 1).views
+    pixels = two.left.points.pixels[:4], two.right.points.pixels[:4]
+    sides = [*["left"] * 4, *["right"] * 4]
+    many = neurocal.triangulate_many(two, [*range(4), *range(4)], sides, np.concatenate(pixels))
+    assert many.points == pytest.approx(triangulate(two, *pixels).points, rel=1e-6)
+    own = triangulate(two, *pixels, noise=(1.0, 3.0)).points
+    assert np.abs(own - many.points).max() > 1e-3
+
+
+def test_one_image_is_searched_for_a_board_like_several() -> None:
+    with pytest.raises(NeurocalError, match="no image shows a chessboard"):
+        neurocal.find_board(np.zeros((40, 40), np.uint8))

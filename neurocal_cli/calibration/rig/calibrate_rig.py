@@ -194,6 +194,7 @@ def calibrate_rig(
     InputError, DegenerateGeometryError
         No view connects some cameras with the others, or the points do not determine the rig.
     """
+    check_kind("points", points, Mapping, "a dict of the points of each camera by its name")
     if len(points) < 2:
         raise UsageError(f"a rig has two cameras or more, not {len(points)}; give the points of each camera")
     for name, one in points.items():

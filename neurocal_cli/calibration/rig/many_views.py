@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -32,6 +32,7 @@ _MAX_STEPS, _HALVINGS = 30, 8
 _SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
 # A rise of the squared error by less, as a factor and in px^2, is rounding.
 _RISE, _ROUNDING = 1 + 1e-9, 1e-18
+_MOST_POINTS = 10**8  # whose coordinates fit into memory; a larger number is a mistake
 
 
 @frozen_dataclass(eq=False)
@@ -53,7 +54,7 @@ class SpacePoints:
 
 
 def triangulate_many(
-    cameras: Rig | Mapping[str, Camera | Calibration],
+    cameras: Rig | StereoRig | Mapping[str, Camera | Calibration],
     point: ArrayLike,
     camera: Sequence[str] | NDArray[np.str_],
     pixels: ArrayLike,
@@ -65,7 +66,7 @@ def triangulate_many(
 
     Parameters
     ----------
-    cameras : Rig, or dict of Camera or Calibration by name
+    cameras : Rig or StereoRig, or dict of Camera or Calibration by name
     point : (M,) int array
         Number of the point of each row, from 0 to N - 1.
     camera : (M,) texts
@@ -80,11 +81,14 @@ def triangulate_many(
     Raises
     ------
     InputError
-        Arrays of different lengths, an unknown camera, or a point twice in one camera.
+        Arrays of different lengths, numbers of points that are not whole, an unknown camera, or a point twice
+        in one camera.
     """
-    noise = cameras.noise_shares if isinstance(cameras, Rig) else np.ones(len(cameras))
-    if isinstance(cameras, Rig):
-        poses, cameras = cameras.poses, cameras.cameras
+    if isinstance(cameras, Mapping):
+        noise = np.ones(len(cameras))
+    else:
+        rig = any_rig(cameras)
+        noise, poses, cameras = rig.noise_shares, rig.poses, rig.cameras
     if poses is None or set(poses) != set(cameras):
         raise InputError("the poses are not those of the cameras; give the pose of each camera")
     names = list(cameras)
@@ -95,7 +99,10 @@ def triangulate_many(
     if (rows < 0).any():
         unknown = str(labels[rows < 0][0])
         raise InputError(f"there is no camera {unknown!r}; the cameras are {', '.join(names)}")
-    point, pixels = np.asarray(point, dtype=np.intp), real_array("pixels", pixels)
+    number, pixels = real_array("point", point), real_array("pixels", pixels)
+    if not ((number >= 0) & (number < _MOST_POINTS) & (number % 1 == 0)).all():
+        raise InputError("point must be whole numbers from 0 on, those of the points")
+    point = number.astype(np.intp)
     if not (point.shape == rows.shape and pixels.shape == (len(rows), 2)):
         raise InputError("point, camera and pixels must have one entry for each row")
     key = np.sort(point * len(names) + rows)

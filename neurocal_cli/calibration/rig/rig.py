@@ -5,7 +5,6 @@ The poses are relative to the first camera: ``X_name = R X_first + t``, of two `
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
@@ -21,7 +20,7 @@ from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.measured import PlaneErrors
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, check_kind
 
 _LEAST_NOISE = 0.1  # of a camera's pixels over that of all; fewer points may fit better by chance
 
@@ -45,14 +44,9 @@ class FixedCameras(Presented):
         return self.rmse_px / float(np.sqrt(2.0))
 
     @property
-    @abstractmethod
-    def calibrations(self) -> tuple[Calibration, ...]:
-        """The cameras in their order."""
-
-    @property
     def noise_shares(self) -> Array:
         """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known."""
-        own = np.array([camera.sigma for camera in self.calibrations])
+        own = np.array([camera.sigma for camera in any_rig(self).cameras.values()])
         if not (self.sigma > 0 and np.isfinite(own).all()):
             return np.ones(len(own))
         return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
@@ -118,11 +112,6 @@ class StereoRig(FixedCameras):
     delay: tuple[float, float] | None = None
 
     _summary = ("commands.show.rig_report", "stereo_report")
-
-    @property
-    def calibrations(self) -> tuple[Calibration, ...]:
-        """The left and the right camera."""
-        return self.left, self.right
 
     def __repr__(self) -> str:
         std = self.std.get("baseline", float("nan"))
@@ -259,11 +248,6 @@ class Rig(FixedCameras):
         return self.cameras[self.first].unit
 
     @property
-    def calibrations(self) -> tuple[Calibration, ...]:
-        """The cameras in their order."""
-        return tuple(self.cameras.values())
-
-    @property
     def edges(self) -> dict[tuple[str, str], int]:
         """Number of frames that determine the rig by pairs of cameras, as far as they have any in common."""
         names = list(self.cameras)
@@ -362,6 +346,15 @@ def named_std(covariance: Array, t: Array) -> dict[str, float]:
     std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     named = dict(zip(POSE_NAMES, std.tolist(), strict=True))
     return named | {"baseline": float(np.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)))}
+
+
+def any_rig(rig: FixedCameras) -> Rig:
+    """Any rig as one of named cameras; an InputError for anything else."""
+    if isinstance(rig, StereoRig):
+        return of_two(rig)
+    check_kind("rig", rig, Rig, "what calibrate_rig or calibrate_stereo made")
+    assert isinstance(rig, Rig)
+    return rig
 
 
 def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:

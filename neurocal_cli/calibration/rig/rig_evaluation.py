@@ -21,7 +21,7 @@ from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.errors import DegenerateGeometryError, InputError, check_kind
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
@@ -72,6 +72,7 @@ def evaluate_rig(rig: Rig, points: Mapping[str, Correspondences] | None = None) 
     InputError
         There are no points, a camera that the rig does not have, or no frame of several cameras.
     """
+    check_kind("rig", rig, Rig, "what calibrate_rig made; evaluate_stereo_rig is for a StereoRig")
     given = points is not None
     if points is None:
         points = {name: camera.points for name, camera in rig.cameras.items() if len(camera.points)}

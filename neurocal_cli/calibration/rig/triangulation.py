@@ -83,7 +83,13 @@ class Triangulated:
 
 @overload
 def triangulate(
-    left: StereoRig, right: Array, pose: Array, /, *, method: Method = "optimal"
+    left: StereoRig,
+    right: Array,
+    pose: Array,
+    /,
+    *,
+    method: Method = "optimal",
+    noise: ArrayLike | None = None,
 ) -> Triangulated: ...
 
 
@@ -97,7 +103,7 @@ def triangulate(
     *,
     which: NDArray[np.intp] | None = None,
     method: Method = "optimal",
-    noise: ArrayLike = (1.0, 1.0),
+    noise: ArrayLike | None = None,
 ) -> Triangulated: ...
 
 
@@ -110,7 +116,7 @@ def triangulate(
     *,
     which: NDArray[np.intp] | None = None,
     method: Method = "optimal",
-    noise: ArrayLike = (1.0, 1.0),
+    noise: ArrayLike | None = None,
 ) -> Triangulated:
     """Triangulate points from their pixels in two cameras.
 
@@ -127,8 +133,9 @@ def triangulate(
     which : (N,) int array, optional
         Index of each point's rig among several.
     method : {"optimal", "linear", "midpoint"}
-    noise : two of float
-        Standard deviations of the left and the right pixels, in any common unit.
+    noise : two of float, optional
+        Standard deviations of the left and the right pixels, in any common unit. Default: those of the rig,
+        else alike.
 
     Raises
     ------
@@ -139,7 +146,7 @@ def triangulate(
     """
     check_choice("method", method, METHODS)
     if isinstance(left, StereoRig):
-        noise, left_pixels, right_pixels = left.noise_shares, right, pose
+        noise, left_pixels, right_pixels = left.noise_shares if noise is None else noise, right, pose
         left, right, pose = left.left, left.right, left.pose
     elif left_pixels is None or right_pixels is None:
         raise InputError("pixels are missing; give a StereoRig and pixels, or two cameras, a Pose and pixels")
@@ -147,7 +154,7 @@ def triangulate(
     n = len(pixels[0])
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
-    sigma = real_array("noise", noise)
+    sigma = real_array("noise", (1.0, 1.0) if noise is None else noise)
     if sigma.shape != (2,) or not (np.isfinite(sigma) & (sigma > 0)).all():
         raise InputError("noise must be two positive numbers, those of the left and of the right pixels")
     pixels = pixels[0] / sigma[0], pixels[1] / sigma[1]

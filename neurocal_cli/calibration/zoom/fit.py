@@ -57,7 +57,7 @@ from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, WITH_PRISM
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import DegenerateGeometryError, InputError, check_choice, check_seed
+from neurocal_cli.errors import DegenerateGeometryError, InputError, check_choice, check_kind, check_seed
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.target import TARGETS
 
@@ -129,6 +129,7 @@ def fit_lens(
     check_choice("camera", camera, CAMERAS)
     check_choice("target", target, TARGETS)
     check_seed(seed)
+    check_kind("points", points, LensPoints, "what read_lens_points made")
     report = progress or (lambda stage, share: None)
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
@@ -297,6 +298,7 @@ def fit_lens_cameras(
         A negative seed.
     """
     check_seed(seed)
+    check_kind("cameras", cameras, LensCameras, "what LensCameras.of or read_lens_data made")
     report = progress or (lambda stage, share: None)
     distinct = len(np.unique(cameras.settings, axis=0))
     check_settings(distinct, len(cameras.controls), cameras.source)

@@ -25,7 +25,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_jacobian, nearest_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, UsageError, check_kind
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
@@ -333,6 +333,7 @@ def camera_at(
         The setting is not one finite number for each control, or outside the calibrated range; or the
         networks determine no camera there.
     """
+    check_kind("lens", lens, ZoomLens, "what fit_lens or read_lens made")
     setting, outside = lens.check_setting(setting, extrapolate)
     prediction = lens.predict(setting[None])
     values, std = prediction.local[0], prediction.std[0]

@@ -17,11 +17,12 @@ from neurocal_cli.commands.show.html_page import table, verdict_block
 from neurocal_cli.commands.show.rig_report import pose_rows, rig_rows, side_rows
 from neurocal_cli.commands.show.text import Table
 from neurocal_cli.commands.show.zoom_report import draw_lens, network_rows
-from neurocal_cli.errors import InputError, UsageError, check_choice
+from neurocal_cli.errors import InputError, UsageError, check_choice, check_kind
 
 if TYPE_CHECKING:
     from neurocal_cli.commands.show.html_reports import Result
 
+_RESULTS, _MADE = (Calibration, StereoRig, Rig, ZoomLens), "what calibrate, calibrate_rig or fit_lens made"
 _KINDS = ("png", "svg", "pdf")
 
 
@@ -56,6 +57,7 @@ def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> st
     from neurocal_cli.commands.show.html_page import Origin, versions
     from neurocal_cli.commands.show.html_reports import page_of
 
+    check_kind("result", result, _RESULTS, _MADE)
     if photographs and not isinstance(result, Calibration):
         raise UsageError("only the page of a Calibration shows photographs; leave them out")
     return page_of(result, Origin({}, versions=versions()), [photographs] if photographs else ())
@@ -84,6 +86,7 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
     NeurocalError
         matplotlib is not installed.
     """
+    check_kind("result", result, _RESULTS, _MADE)
     check_choice("kind", kind, _KINDS)
     if isinstance(result, Calibration) and panel == "next":
         from neurocal_cli.commands.show.advice import draw_advice
