@@ -181,7 +181,7 @@ def test_arguments_of_another_kind_are_named_with_what_to_give() -> None:
         (lambda: neurocal.rectify(camera()), "rig must be a StereoRig, not Calibration"),
         (lambda: neurocal.evaluate_stereo_rig(camera()), "rig must be a StereoRig"),
         (lambda: neurocal.evaluate_rig(camera()), "rig must be a Rig, not Calibration"),
-        (lambda: neurocal.find_rig_drift(rig(), camera()), "rig must be a Rig, not Calibration"),
+        (lambda: neurocal.find_rig_drift(rig(), camera()), "rig must be a Rig or StereoRig, not"),
         (lambda: neurocal.triangulate_many(rig(), [0, 0.5], ["left", "right"], [[1, 2], [3, 4]]), "be whole"),
         (lambda: neurocal.triangulate_many(rig(), [-1, 0], ["left", "right"], [[1, 2], [3, 4]]), "be whole"),
         (lambda: neurocal.fit_lens(points), "points must be a LensPoints, not Correspondences"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class FixedCameras(Presented):
     @property
     def noise_shares(self) -> Array:
         """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known."""
-        own = np.array([camera.sigma for camera in any_rig(self).cameras.values()])
+        own = np.array([camera.sigma for camera in any_rig(cast("Rig", self)).cameras.values()])
         if not (self.sigma > 0 and np.isfinite(own).all()):
             return np.ones(len(own))
         return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
@@ -348,13 +348,10 @@ def named_std(covariance: Array, t: Array) -> dict[str, float]:
     return named | {"baseline": float(np.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)))}
 
 
-def any_rig(rig: FixedCameras) -> Rig:
+def any_rig(rig: Rig | StereoRig) -> Rig:
     """Any rig as one of named cameras; an InputError for anything else."""
-    if isinstance(rig, StereoRig):
-        return of_two(rig)
-    check_kind("rig", rig, Rig, "what calibrate_rig or calibrate_stereo made")
-    assert isinstance(rig, Rig)
-    return rig
+    check_kind("rig", rig, (Rig, StereoRig), "what calibrate_rig or calibrate_stereo made")
+    return of_two(rig) if isinstance(rig, StereoRig) else rig
 
 
 def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:

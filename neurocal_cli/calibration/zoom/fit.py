@@ -337,8 +337,6 @@ def fit_lens_cameras(
         free_theta=cameras.theta != np.pi / 2,
         counts=np.zeros(S, dtype=np.int64),
         rmse=np.full(S, np.nan),
-        rejected=(),
-        left_out_px=np.nan,
         training="one at a time",
         seed=seed,
         converged=True,

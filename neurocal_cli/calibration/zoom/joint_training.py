@@ -59,10 +59,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 
-# Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
-# stay within 1.04 of the noise floor even between settings (slow tests in test_zoom_lens.py).
-_POOR_FIT = 1.5
-
 # The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
 # out in test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
 # changes sharply is rejected.
@@ -241,7 +237,6 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
         counts=start.data.counts,
         rmse=np.full(start.lens.n_settings, np.nan),
         rejected=start.rejected,
-        left_out_px=np.nan,
         training=options.training,
         seed=options.seed,
         converged=all(joint.converged for joint in joints) and start.tables.converged,
@@ -311,13 +306,6 @@ def _warnings(lens: ZoomLens, start: CalibratedSettings) -> tuple[str, ...]:
     for rejected in lens.rejected:
         where = describe(lens.controls, np.array(rejected.setting))
         warnings.append(f"the setting {where} is left out: {rejected.reason}")
-    tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
-    if lens.rmse_px > _POOR_FIT * tables_rms:
-        warnings.append(
-            f"the error of the networks is {lens.rmse_px:.3g} px, that of separate settings {tables_rms:.3g} "
-            "px: the lens does not return to the same position, or changes too much between the settings; "
-            "give more settings"
-        )
     return tuple(warnings)
 
 

@@ -47,7 +47,7 @@ _LARGEST_TILT = 0.99
 _FLAT = 1e-4  # of free weights: a standard deviation of 100
 _MOST = 1e4
 _LEAST, _LEAST_FEW, _LEAST_SPARSE, _LEAST_TILT = 0.03, 0.3, 1.0, 1.0
-_FEW_VALUES, _ENOUGH_VALUES = 4, 4
+_ENOUGH_VALUES = 4
 # The descent has no criterion to stop: the priors are updated until the schedule ends.
 _OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
@@ -323,7 +323,7 @@ def updated_precision(
     """
     kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
     least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
-    if max(len(np.unique(column)) for column in x.T) <= _FEW_VALUES:
+    if max(len(np.unique(column)) for column in x.T) <= _ENOUGH_VALUES:
         least[: 5 + D] = _LEAST_FEW
     least[2 : 2 + D][sparse] = _LEAST_SPARSE
     least[6 + D] = _LEAST_TILT

@@ -64,13 +64,13 @@ class ZoomLens(Summarised):
         Points of each setting.
     rmse : (S,) array [px]
         Reprojection error at each setting; nan for known cameras.
+    training : str
+    seed : int
+    converged : bool
     rejected : tuple of RejectedSetting
     left_out_px : float
         Cross-validation error: each setting that is not at an end of a control, predicted from all others;
         nan where unknown.
-    training : str
-    seed : int
-    converged : bool
     image_size : (width, height) or None
     unit : str
     warnings : tuple of str
@@ -96,11 +96,11 @@ class ZoomLens(Summarised):
     free_theta: bool
     counts: NDArray[np.int64]
     rmse: Array
-    rejected: tuple[RejectedSetting, ...]
-    left_out_px: float
     training: str
     seed: int
     converged: bool
+    rejected: tuple[RejectedSetting, ...] = ()
+    left_out_px: float = np.nan
     image_size: tuple[int, int] | None = None
     unit: str = "mm"
     warnings: tuple[str, ...] = ()
