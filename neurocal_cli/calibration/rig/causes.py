@@ -367,7 +367,7 @@ def _frames_of(problem: RigProblem, subject: int) -> tuple[NDArray[np.intp], lis
     views = {k: own for k, own in enumerate(problem.views) if len(own) > 1 and (anyone or subject in own)}
     names = {k: list(own.values())[: 1 + of_two] if anyone else [own[subject]] for k, own in views.items()}
     order = in_sequence(tuple(own[0] for own in names.values()))
-    frames = np.array(list(names), dtype=np.intp)[order]
+    frames = np.array(list(names), dtype=np.intp)[list(order)]
     return frames, ["/".join(names[k]) for k in frames.tolist()]
 
 

@@ -183,13 +183,10 @@ def or_else(causes: Iterable[str]) -> str:
     return f" (or, hardly less probable: {told})" if told else ""
 
 
-def in_sequence(names: tuple[str, ...]) -> list[int]:
-    """Indices that sort names of views in natural order, in which img2 comes before img10."""
-    return list(_sequence(names))
-
-
 @lru_cache(maxsize=4)  # each rival asks for it
-def _sequence(names: tuple[str, ...]) -> tuple[int, ...]:
+def in_sequence(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Indices that sort names of views in natural order, in which img2 comes before img10."""
+
     def key(place: int) -> list[tuple[bool, int, str]]:
         parts = re.findall(r"\d+|\D+", names[place])
         return [(not part[0].isdecimal(), int(part) if part[0].isdecimal() else 0, part) for part in parts]

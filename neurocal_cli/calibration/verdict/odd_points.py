@@ -318,10 +318,10 @@ def _rejected_points(calibration: Calibration, explained: bool) -> Iterator[Find
 
 def _of_views(calibration: Calibration, lost: Correspondences) -> dict[str, int]:
     """Number of outliers in views that lost many of their points, but not all."""
-    kept = dict(
-        zip(calibration.points.view_names, np.bincount(calibration.points.view_index).tolist(), strict=True)
+    kept, counts = (
+        dict(zip(points.view_names, np.bincount(points.view_index).tolist(), strict=True))
+        for points in (calibration.points, lost)
     )
-    counts = dict(zip(lost.view_names, np.bincount(lost.view_index).tolist(), strict=True))
     return {
         name: count
         for name, count in counts.items()
