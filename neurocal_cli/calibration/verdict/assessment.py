@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.camera_covariance import CameraSeen, camera_covariance
 from neurocal_cli.adjustment.chi_squared import chi_squared
 from neurocal_cli.adjustment.common_noise import weighed
@@ -28,7 +28,7 @@ from neurocal_cli.adjustment.cross_validation import (
 )
 from neurocal_cli.adjustment.free_networks import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.adjustment.normal_equations import NOTHING
-from neurocal_cli.adjustment.problem import normalised
+from neurocal_cli.adjustment.problem import normalised, problem_for
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
@@ -39,12 +39,14 @@ from neurocal_cli.calibration.calibration import (
     estimated_parameters,
     free_entries,
 )
-from neurocal_cli.calibration.verdict.contest import Contest, contest
+from neurocal_cli.calibration.verdict.contest import Contest, contest, given_camera
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
+    LEVEL,
     ROUNDED,
     SPARE,
     Finding,
+    log_odds,
     pixel_spread,
     verdict_of,
 )
@@ -60,10 +62,10 @@ from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import OUTLIERS, repeated_views, with_rejected
 from neurocal_cli.calibration.verdict.rules import reach_verdict
-from neurocal_cli.calibration.verdict.what_is_given import hidden_centre, unlike_axes
+from neurocal_cli.calibration.verdict.what_is_given import unlike_axes
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
-from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.geometry import Array, cross_matrix, median
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
@@ -71,6 +73,7 @@ from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import std_of_scale
 
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
+_DISPLACED = "k1k2"  # the model instead of a rich lens
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
 _DISTANT = 10.0  # times the distance of the farthest point
 
@@ -331,11 +334,14 @@ class _AtMinimum:
         remains = kept is not None and any(one.rival is held.causes[0].rival for one in kept.causes)
         return replace(held, of_outliers=True, remains=remains)
 
-    def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
+    def _contest_at(
+        self, views: Views, state: CameraState, free: NDArray[np.bool_] | None = None
+    ) -> Contest | None:
         target = self.calibration.target
         held = contest(
-            views, state, free_entries(self.calibration, NODES), self.free_poses, self.points.image_size,
-            worth=self.repeated.worth, shaped=target is not None and target.bends is None,
+            views, state, free_entries(self.calibration, NODES) if free is None else free, self.free_poses,
+            self.points.image_size, worth=self.repeated.worth,
+            shaped=target is not None and (free is not None or target.bends is None),
         )  # fmt: skip
         if held is None or not self.free_poses:
             return held
@@ -343,13 +349,47 @@ class _AtMinimum:
         return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
 
     def _of_given(self) -> list[Finding]:
-        """What the points say against a given centre that the lens or the target hides."""
-        target = self.calibration.target
-        if self.calibration.type != 2 or self._is_exact():
+        """What the points say against a given centre that the lens or the target hides.
+
+        The poses absorb a wrong centre, and tangential distortion, a rich lens or the shape of the target the
+        rest. So the causes compete without these. Real lenses have less tangential distortion than hides a
+        wrong centre, so the centre comes first unless the lens is more probable.
+        """
+        c, target, state = self.calibration, self.calibration.target, self.given
+        free, shaped = free_entries(c, NODES), target is not None or state.model == "rich"
+        if state.model == "rich":
+            state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
+            free = np.append(free[:5], np.ones(len(state.k), dtype=bool))
+        hides = free[5:] & np.isin(coefficient_names(state.model), ("p1", "p2")) & (not shaped)
+        if c.type != 2 or self._is_exact() or not (shaped or hides.any()):
             return []
         points = self.points if target is None else target.as_given(self.points)
         views = self.views if target is None else self._arranged(points)
-        return hidden_centre(self.calibration, points, views, self.given, self.repeated.worth)
+        state = normalised(replace(state, k=np.where(hides, 0.0, state.k)), views)
+        free[5:] &= ~hides
+        held = self._contest_at(views, adjust(views.batches, state, free, True, NEARBY).state, free)
+        if held is None or not any(one.rival.of_given for one in held.causes):
+            return []
+        left = (1.0 - held.explained) * held.lin.cost
+        if hides.any() and log_odds(self.cost, left, held.n) < -LEVEL:
+            return []
+        if shaped:
+            off = self._centre_with_shape(points, views, state) / held.lin.state.entries[0, 0]
+            causes = [replace(one, amounts=np.append(one.amounts[:-2], off)) for one in held.causes]
+            held = replace(held, causes=tuple(one for one in causes if one.rival.of_given))
+        return given_camera(held, c)
+
+    def _centre_with_shape(self, points: Correspondences, views: Views, state: CameraState) -> Array:
+        """(2,) how far the given centre is off if the shape of the target is estimated, too; normalised."""
+        from neurocal_cli.adjustment.board.find import find_target
+
+        skew, square = "theta" not in self.calibration.fixed, self.calibration.square_pixels
+        problem = problem_for(points, 1, skew=skew, distortion=Distortion(state.model), square=square)
+        problem = replace(problem, views=views)
+        fit = problem, problem.adjust(state)
+        found = find_target([fit])
+        _, adjusted = fit if found is None else found.fits[0]
+        return np.asarray(adjusted.state.entries[0, 3:] - state.entries[0, 3:])
 
     def _mistake(self, contradiction: float) -> tuple[str, str] | None:
         """A mistake in all views, and what to do, if they contradict each other or lost points."""

@@ -1,6 +1,4 @@
-"""Test whether what is given is wrong: the axes of a flat board, or an image centre.
-
-`proportions` tests whether the two axes have different units, or the squares are not square.
+"""Test whether the two axes of a flat board have different units, or its squares are not square.
 
 A board that is turned in its plane from view to view fits no camera then: where one axis is s times too
 short, each view asks for another ratio of alpha_u to alpha_v. The columns h_1, h_2 of the homography of a
@@ -11,11 +9,6 @@ board whose first axis is multiplied by s fulfil
 which is linear in omega for a given s. A camera is fitted to the board with the s whose equations have the
 smallest residual, and the rival of a stretched target refines it. It is the cause if the camera then fits
 nearly as well as a separate camera for each view, and far better than with the coordinates as they are given.
-
-`hidden_centre` tests a given centre. The poses absorb a wrong centre, and tangential distortion or the shape
-of the target the rest, so the error hardly grows and no cause is open. Therefore the camera is fitted with a
-free centre: without tangential distortion, or with the target estimated again, because a bent target and a
-wrong centre may explain the points only together.
 """
 
 from __future__ import annotations
@@ -24,107 +17,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.free_networks import variance_of_views
-from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     DETERMINE,
     EXPLAINED,
-    LEVEL,
-    Finding,
-    log_odds,
 )
 from neurocal_cli.calibration.verdict.linearised import Board
 from neurocal_cli.calibration.verdict.mistakes import ENOUGH_VIEWS, FEWEST_POINTS, solved
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import causes_among
-from neurocal_cli.calibration.verdict.rivals import CHANGED, SAME, SHAPES
-from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
+from neurocal_cli.calibration.verdict.rivals import SHAPES
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.homographies import homographies
 from neurocal_cli.camera.pinhole import omega_of, product_of
-from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
-
-_TANGENTIAL = frozenset({"p1", "p2"})
-_DISPLACED = "k1k2"  # the model instead of a rich lens, and that of boards with unlike axes
-_Fit = tuple[Problem, Adjusted]
-
-
-def hidden_centre(
-    calibration: Calibration, points: Correspondences, views: Views, state: CameraState, worth: float
-) -> list[Finding]:
-    """What the points say against the given centre if what was estimated hides it: the target, or the lens.
-
-    `points` have the target as given, `views` are the same, weighted as in the calibration, and the state is
-    in pixels and world units. `worth` is the effective share of the views if they repeat poses.
-    """
-    shaped = calibration.target is not None
-    if state.model == "rich":  # as flexible as a target
-        shaped, state = True, replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
-    names, before = coefficient_names(state.model), state.entries[0, 3:]
-    hiding = frozenset() if shaped else _TANGENTIAL.intersection(names) - calibration.fixed
-    if not (shaped or hiding):
-        return []
-
-    def fitted(free_centre: bool, without: frozenset[str]) -> _Fit:
-        problem = problem_for(
-            points,
-            1 if free_centre else 2,
-            image_center=None if free_centre else (float(before[0]), float(before[1])),
-            skew="theta" not in calibration.fixed,
-            distortion=Distortion(state.model),
-            square=calibration.square_pixels,
-        )
-        known = calibration.fixed - {"u0", "v0"} | without
-        problem = replace(problem, views=views, fixed=problem.fixed | known)
-        k = np.where(np.isin(names, list(without)), 0.0, state.k)
-        return problem, problem.adjust(normalised(replace(state, k=k), views))
-
-    kept, free = fitted(False, frozenset()), fitted(True, hiding)
-    found = _with_target(kept, free) if shaped else _with_lens(fitted(False, hiding), kept, free, worth)
-    if found is None:
-        return []
-    (problem, adjusted), explained = found
-    after = problem.matrix(adjusted.state.entries[0])[:2, 2]
-    told = ", ".join(
-        f"{name} = {old:.5g} is given, but the points give {new:.5g} px"
-        for name, old, new in zip(("u0", "v0"), before, after, strict=True)
-    )
-    grade = CHANGED.grade(float(np.abs(after - before).max() / calibration.intrinsics.alpha_u))
-    return [(max(grade, 2 * int(explained > EXPLAINED)), told, SAME)]
-
-
-def _with_target(kept: _Fit, free: _Fit) -> tuple[_Fit, float] | None:
-    """The fit with another target and a free centre, if it is more probable than with the given centre.
-
-    Its second result is the share of the squared error that the centre explains; here the target may do so.
-    """
-    from neurocal_cli.adjustment.board.find import find_target, gain_over_given
-
-    known, found = find_target([kept]), find_target([free])
-    if found is None:
-        return None
-    gain = gain_over_given(found, [kept]) if known is None else found.evidence - known.evidence
-    return (found.fits[0], 0.0) if gain > LEVEL else None
-
-
-def _with_lens(plain: _Fit, kept: _Fit, free: _Fit, worth: float) -> tuple[_Fit, float] | None:
-    """The same of a free centre, if it explains what the lens did, and the lens is not more probable.
-
-    Real lenses have less tangential distortion than hides a wrong centre, so the centre comes first.
-    """
-    (problem, adjusted), costs = free, [float(fit.cost.sum()) for _, fit in (plain, kept, free)]
-    alike = correlation(problem.views, point_residuals(problem.views, adjusted.state))
-    n = effective_number(max(problem.views.n_equations - problem.n_parameters, 1.0) * worth, alike)
-    told = log_odds(costs[0], costs[2], n, 2) > LEVEL and log_odds(costs[1], costs[2], n) > -LEVEL
-    return (free, 1.0 - costs[2] / costs[0]) if told else None
-
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
@@ -223,7 +132,7 @@ def _fitted(points: Correspondences, axis: int, s: float, skew: bool = True) -> 
     """The camera for points with an axis multiplied by s, with or without skew; None if there is none."""
     world = points.world.copy()
     world[:, axis] *= s
-    return solved(replace(points, world=world), 1, skew=skew, distortion=Distortion(_DISPLACED))
+    return solved(replace(points, world=world), 1, skew=skew, distortion=Distortion("k1k2"))
 
 
 def _refined(found: Solution, axes: tuple[int, int]) -> float:
