@@ -267,7 +267,7 @@ def _explained(error: DegenerateGeometryError, points: Correspondences, type: in
 def _true_cause(points: Correspondences, type: int) -> str:
     """Why points are refused, if it is another cause than what the refusal says; else ""."""
     from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
-    from neurocal_cli.calibration.verdict.what_is_given import unlike_axes
+    from neurocal_cli.calibration.verdict.proportions import unlike_axes
 
     return "; ".join(mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None) or ())
 

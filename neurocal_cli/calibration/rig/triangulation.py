@@ -272,40 +272,24 @@ def _rectified(m: Matches) -> Matches | None:
 
 _ORIGINALS = "give pixels of the original images"
 _CONVENTION = "R and t of the rig do not map the left camera to the right one, but"
+_RESIZED = "give pixels of images of the calibrated size"
+# What is wrong, what to do, and the matches without the mistake.
 _TRIED: tuple[tuple[str, str, Callable[[Matches], Matches | None]], ...] = (
-    (
-        "the left and the right pixels are exchanged", "give uL,vL of the left camera",
-        lambda m: replace(m, left=m.right, right=m.left),
-    ),
-    (
-        "u and v are exchanged", "name the columns in their order",
-        lambda m: replace(m, left=m.left[:, ::-1], right=m.right[:, ::-1]),
-    ),
-    (
-        "the pixels are of images of half the size", "give pixels of images of the calibrated size",
-        _scaled(2.0),
-    ),
-    (
-        "the pixels are of images of twice the size", "give pixels of images of the calibrated size",
-        _scaled(0.5),
-    ),
-    (
-        "the pixels are undistorted already", _ORIGINALS,
-        lambda m: replace(m, cameras=[replace(one, distortion=Distortion()) for one in m.cameras]),
-    ),
+    ("the left and the right pixels are exchanged", "give uL,vL of the left camera",
+     lambda m: replace(m, left=m.right, right=m.left)),
+    ("u and v are exchanged", "name the columns in their order",
+     lambda m: replace(m, left=m.left[:, ::-1], right=m.right[:, ::-1])),
+    ("the pixels are of images of half the size", _RESIZED, _scaled(2.0)),
+    ("the pixels are of images of twice the size", _RESIZED, _scaled(0.5)),
+    ("the pixels are undistorted already", _ORIGINALS,
+     lambda m: replace(m, cameras=[replace(one, distortion=Distortion()) for one in m.cameras])),
     ("the pixels are those of rectified images", _ORIGINALS, _rectified),
-    (
-        f"{_CONVENTION} their inverse does", "correct the rig",
-        lambda m: replace(m, pose=Pose(m.pose.R.T, -m.pose.R.T @ m.pose.t)),
-    ),
-    (
-        f"{_CONVENTION} -t instead of t does", "correct the rig",
-        lambda m: replace(m, pose=Pose(m.pose.R, -m.pose.t)),
-    ),
-    (
-        f"{_CONVENTION} the transposed R does", "correct the rig",
-        lambda m: replace(m, pose=Pose(m.pose.R.T, m.pose.t)),
-    ),
+    (f"{_CONVENTION} their inverse does", "correct the rig",
+     lambda m: replace(m, pose=Pose(m.pose.R.T, -m.pose.R.T @ m.pose.t))),
+    (f"{_CONVENTION} -t instead of t does", "correct the rig",
+     lambda m: replace(m, pose=Pose(m.pose.R, -m.pose.t))),
+    (f"{_CONVENTION} the transposed R does", "correct the rig",
+     lambda m: replace(m, pose=Pose(m.pose.R.T, m.pose.t))),
 )  # fmt: skip
 MISTAKES = tuple(
     Mistake(text, "without it, most matches fit the rig", advice, said(text), POOR, mended)

@@ -33,12 +33,7 @@ from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.views import Views, arrange
-from neurocal_cli.calibration.calibration import (
-    Calibration,
-    Verdict,
-    estimated_parameters,
-    free_entries,
-)
+from neurocal_cli.calibration.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.calibration.verdict.contest import Contest, contest, given_camera
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
@@ -61,8 +56,8 @@ from neurocal_cli.calibration.verdict.measures import (
 from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import OUTLIERS, repeated_views, with_rejected
+from neurocal_cli.calibration.verdict.proportions import unlike_axes
 from neurocal_cli.calibration.verdict.rules import reach_verdict
-from neurocal_cli.calibration.verdict.what_is_given import unlike_axes
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
@@ -257,11 +252,7 @@ class _AtMinimum:
             contest=self._contest() if causes and not stated else None,
             of_given=tuple(self._of_given()),
             mirrored=tuple(seen_from_behind(views, self.state)),
-            noise=(
-                *stated,
-                *self._survey(),
-                *noise_shape(self.points, residuals, alike),
-            ),
+            noise=(*stated, *self._survey(), *noise_shape(self.points, residuals, alike)),
             stated=bool(stated),
             mistake=self._mistake(contradiction),
         )
@@ -343,8 +334,8 @@ class _AtMinimum:
             self.points.image_size, worth=self.repeated.worth,
             shaped=target is not None and (free is not None or target.bends is None),
         )  # fmt: skip
-        if held is None or not self.free_poses:
-            return held
+        if held is None:
+            return None
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
         return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
 

@@ -17,6 +17,7 @@ from neurocal_cli.calibration.verdict.findings import (
     in_sequence,
     name_some,
     percent,
+    two_digits,
 )
 from neurocal_cli.calibration.verdict.rival import Say, Told
 from neurocal_cli.camera.geometry import Array
@@ -274,4 +275,6 @@ def wrongly_given_lens(told: Told) -> Said:
 
 def _poses(told: Told) -> str:
     moved = told.moved_poses
-    return f"; the poses are then {moved:.2g} standard deviations from the reported ones" if moved > 1 else ""
+    if not moved > 1:
+        return ""
+    return f"; the poses are then {two_digits(moved)} standard deviations from the reported ones"

@@ -99,15 +99,15 @@ class ZoomCause(Cause[ZoomLens]):
     """A cause of an error above the noise floor, by what it leaves of that."""
 
     left: Callable[[ZoomLens], float]  # rms error with it [px]; nan if that is unknown
-    unknowns: Callable[[int, int], int]  # of S settings with L parameters each
     of_one: bool = False  # any one of the settings, or all
+    more: int = 0  # unknowns of each setting besides its parameters
 
     def odds(self, lens: ZoomLens) -> float:
         """Log odds over nothing."""
-        S, L = len(lens.settings), len(lens.names)
         before, after = (max(px, _EXACT) ** 2 for px in (lens.rmse_px, self.left(lens)))
-        choices = S if self.of_one else 1
-        return log_odds(before, after, 2 * int(lens.counts.sum()), self.unknowns(S, L), choices)
+        settings, choices = (1, len(lens.settings)) if self.of_one else (len(lens.settings), 1)
+        unknowns = settings * (len(lens.names) + self.more)
+        return log_odds(before, after, 2 * int(lens.counts.sum()), unknowns, choices)
 
 
 def _without_worst(lens: ZoomLens) -> float:
@@ -144,19 +144,18 @@ CAUSES = (
     ZoomCause(
         "a wrong setting", "one setting has most of the error",
         "check the name and the points of this setting",
-        _is_wrong_setting, ELSEWHERE, _without_worst, lambda S, L: L, of_one=True,
+        _is_wrong_setting, ELSEWHERE, _without_worst, of_one=True,
     ),
     ZoomCause(
         "settings that contradict each other", "with a camera for each setting, only noise is left",
         "check that the lens returns to the same position, that camera and target stay where they are "
         "(or give --camera moving), and that the settings have their true names",
-        _contradict, ELSEWHERE, lambda lens: lens.noise_floor_px, lambda S, L: S * L,
+        _contradict, ELSEWHERE, lambda lens: lens.noise_floor_px,
     ),
     ZoomCause(
         "a camera that moves between the settings", "with a camera and a pose for each, less is left",
         "give --camera moving, or keep both where they are",
-        _has_moved, ELSEWHERE, lambda lens: lens.free_pose_px,
-        lambda S, L: S * (L + 5),  # besides t_z, a pose has five unknowns
+        _has_moved, ELSEWHERE, lambda lens: lens.free_pose_px, more=5,  # of a pose, besides t_z
     ),
 )  # fmt: skip
 """Causes of an error above the noise floor; the likeliest are told, in this order."""

@@ -107,6 +107,7 @@ def test_a_wrong_centre_and_a_board_off_its_file_are_told_together(
     assert found.verdict is not None
     assert found.verdict.word != "good"
     (given,) = [reason for reason in found.verdict.reasons if "is given, but the points give" in reason]
+    assert "standard deviations from the reported ones" in given
     told = dict(re.findall(r"(.0) = [0-9.]+ is given, but the points give ([0-9.]+)", given))
     assert np.abs([float(told["u0"]) - centre[0], float(told["v0"]) - centre[1]]).max() < 3.0
 

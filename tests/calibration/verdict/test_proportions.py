@@ -25,7 +25,7 @@ from support.wrong_inputs import (
 )
 
 from neurocal_cli import Correspondences, Pose, calibrate, read_points
-from neurocal_cli.calibration.verdict.what_is_given import proportions
+from neurocal_cli.calibration.verdict.proportions import proportions
 from neurocal_cli.camera.distortion import distort
 from neurocal_cli.errors import DegenerateGeometryError
 

@@ -19,11 +19,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.calibration.verdict.findings import (
-    CONTRADICTION,
-    DETERMINE,
-    EXPLAINED,
-)
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION, DETERMINE, EXPLAINED
 from neurocal_cli.calibration.verdict.linearised import Board
 from neurocal_cli.calibration.verdict.mistakes import ENOUGH_VIEWS, FEWEST_POINTS, solved
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
@@ -76,11 +72,9 @@ def proportions(points: Correspondences) -> Proportions | None:
     if not rms**2 < (1.0 - EXPLAINED) * given_px**2:
         return None
     first, second = ("XYZ"[axis] for axis in axes)
-    return (
-        Proportions(first, second, s, rms, given_px)
-        if s > 1
-        else Proportions(second, first, 1 / s, rms, given_px)
-    )
+    if s < 1:
+        first, second, s = second, first, 1 / s
+    return Proportions(first, second, s, rms, given_px)
 
 
 def unlike_axes(points: Correspondences) -> tuple[str, str] | None:
