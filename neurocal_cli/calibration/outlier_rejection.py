@@ -166,10 +166,6 @@ def _contradicts_noise(solution: Solution, errors: PointErrors) -> bool:
     return odd_view(solution) is not None
 
 
-def _fitted(problem: Problem, mask: NDArray[np.bool_], options: Options) -> Solution:
-    return fit(problem.with_points(problem.points.select(mask)), options)
-
-
 def _agreeing(
     problem: Problem, options: Options, first: Solution | None, failure: DegenerateGeometryError | None
 ) -> tuple[_Kept, Solution]:
@@ -195,7 +191,7 @@ def _agreeing(
         return kept, first
     _refuse_few(points, kept, failure)
     try:
-        solution = _fitted(problem, kept.mask, options)
+        solution = fit(problem.with_points(points.select(kept.mask)), options)
     except DegenerateGeometryError:
         if failure is not None:
             raise failure from None
@@ -209,7 +205,7 @@ def _agreeing(
         if again.hopeless.sum() > consensus.hopeless.sum() or not again.looseness < consensus.looseness:
             break
         kept, consensus = _kept_by(again, views, points), again
-        solution = _fitted(problem, kept.mask, options)
+        solution = fit(problem.with_points(points.select(kept.mask)), options)
     return kept, solution
 
 

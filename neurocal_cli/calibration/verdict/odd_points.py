@@ -195,11 +195,8 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
         return
     worlds = worlds_by_view(points)
     step, error = _steps(worlds).T
-    # The spacing that most views have; of equally common ones, that in the middle, the first of two.
     log = np.log(step)
-    alike = (np.abs(log[:, None] - log[None]) < np.log(_SCALED)).sum(axis=1)
-    common = np.flatnonzero(alike == alike.max())
-    middle = common[np.abs(log[common] - median(log)).round(6).argmin()]
+    middle = np.abs(log - median(log)).round(6).argmin()  # that most views have; of two, the first one's
     ratios = log - log[middle]
     off = np.abs(ratios) > np.log(_SCALED) + TOLD * np.hypot(error, error[middle])
     if not off.any():

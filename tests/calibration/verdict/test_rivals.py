@@ -154,6 +154,15 @@ def test_a_crop_is_told() -> None:
     assert "the images come from two cameras, or one part is cropped" in reasons(found)
 
 
+@pytest.mark.slow
+def test_images_of_another_width_are_told_beside_a_bend() -> None:
+    points, _ = target_photographed("parabola", 801, 14, 0.6, sigma=0.15)
+    wider = np.where(np.isin(points.view_index, [0, 3, 4, 9])[:, None], points.pixels * [0.01, 0.0], 0.0)
+    verdict = calibrate(displaced(points, wider), target="given", outliers="keep").verdict
+    assert verdict is not None
+    assert any("two cameras" in why and "v00, v03, v04 and 1 more fit" in why for why in verdict.reasons)
+
+
 def test_two_targets_are_told() -> None:
     points, _ = target_photographed("flat", 770, 14, 0.0, sigma=0.1)
     longer = np.where((points.view_index >= 7)[:, None], [1.01, 1.0, 1.0], 1.0)
