@@ -351,7 +351,8 @@ class _AtMinimum:
         if state.model == "rich":
             state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
             free = np.append(free[:5], np.ones(len(state.k), dtype=bool))
-        hides = free[5:] & np.isin(coefficient_names(state.model), ("p1", "p2")) & (not shaped)
+        names = coefficient_names(state.model)
+        hides = free[5:] & np.array([name in ("p1", "p2") for name in names], dtype=bool) & (not shaped)
         if c.type != 2 or self._is_exact() or not (shaped or hides.any()):
             return []
         points = self.points if target is None else target.as_given(self.points)
@@ -366,8 +367,9 @@ class _AtMinimum:
             return []
         if shaped:
             off = self._centre_with_shape(points, views, state) / held.lin.state.entries[0, 0]
-            causes = [replace(one, amounts=np.append(one.amounts[:-2], off)) for one in held.causes]
-            held = replace(held, causes=tuple(one for one in causes if one.rival.of_given))
+            given = [one for one in held.causes if one.rival.of_given]
+            moved = tuple(replace(one, amounts=np.append(one.amounts[:-2], off)) for one in given)
+            held = replace(held, causes=moved)
         return given_camera(held, c)
 
     def _centre_with_shape(self, points: Correspondences, views: Views, state: CameraState) -> Array:
