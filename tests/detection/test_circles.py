@@ -175,6 +175,16 @@ def test_a_part_of_the_board_is_known_by_the_paper_around_it(form: str) -> None:
         detect_points(pale, scene.board)
 
 
+def test_circles_that_are_partly_hidden_make_the_others_no_less_certain() -> None:
+    scene = marked_scene(plane_of("asymmetric_circles:4x11:20:16"), 9, square=14.0, noise=1.0)
+    picture = taken(scene, 9)
+    image = picture.image.copy()
+    image[:, int(picture.truth.planes[0].vertices[..., 0].mean()) :] = 128
+    whole, part = (detect_points(one, scene.board) for one in (picture.image, image))
+    assert len(part.ids) >= 18
+    assert np.median(part.covariance[:, 0]) < 1.15 * np.median(whole.covariance[:, 0])
+
+
 def test_circles_of_a_board_have_a_file_of_their_own() -> None:
     planes = (replace(plane_of(SYMMETRIC), name="a"), replace(plane_of(ASYMMETRIC), name="b"))
     with pytest.raises(InputError, match="one plane"):

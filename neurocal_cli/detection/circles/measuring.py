@@ -47,7 +47,7 @@ from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
-from neurocal_cli.detection.fitting.strips import GridImage, Single, packed
+from neurocal_cli.detection.fitting.strips import ANCHOR, GridImage, Single, packed
 from neurocal_cli.detection.grey import eight_bits, least_variance
 from neurocal_cli.detection.grid import VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located
@@ -199,7 +199,7 @@ def measure_circles(
     index = np.concatenate([circles.place[kept], _missed(plane, circles.place)])
     places = plane.spread(index.astype(float))
     apart = np.sqrt(2) if plane.asymmetric else 1.0
-    blur, shading = _FIRST_BLUR, None
+    blur, shading, some = _FIRST_BLUR, None, np.ones(len(places), dtype=np.bool_)
     for done in range(1, _MOST_ROUNDS + 1):
         band = _band(light, found.map, places, radius, _ROOM * apart)
         pixels = outline_pixels(light, found.map, places, radius, blur, band, shading)
@@ -211,7 +211,7 @@ def measure_circles(
             return measure_circles(undone, plane, circles, floor * gained, undo=False)
         undo = False
         centre = found.map.at(places) + fit.values[:, :2]
-        mapped, departure = _mapped(raw, found, places, centre, fit)
+        mapped, departure = _mapped(raw, found, places, centre, fit, some)
         good = is_reliable(fit, departure)
         moved = np.sqrt(((mapped.map.at(places) - found.map.at(places)) ** 2).mean())
         found = mapped
@@ -352,12 +352,16 @@ def circle_model(data: CirclePixels, values: Array, shape: ProfileShape) -> Line
 
 
 def _mapped(
-    raw: GridImage, found: MapFit, places: Array, centre: Array, fit: BatchFit
+    raw: GridImage, found: MapFit, places: Array, centre: Array, fit: BatchFit, good: NDArray[np.bool_]
 ) -> tuple[MapFit, Array]:
-    """The map through measured centres, and their departures from it in standard deviations."""
+    """The map through measured centres, and their departures from it in standard deviations.
+
+    Those that are not `good`, as they are partly hidden, would make the print seem uneven.
+    """
     n = len(places)
     variance = np.concatenate([np.maximum(fit.covariance[:, k, k], 1e-12) for k in (0, 1)])
-    points = replace(Observations.of_points(places, centre, 1.0), variance=variance)
+    trusted = np.where(np.tile(good, 2), variance, ANCHOR**2)
+    points = replace(Observations.of_points(places, centre, 1.0), variance=trusted)
     mapped = wide_if_needed(raw, select_map(found.map, points, np.zeros(0)), points)
     expected = variance + np.concatenate(
         [mapped.map.variance(places, np.tile(axis, (n, 1))) for axis in np.eye(2)]
