@@ -18,9 +18,10 @@ from support.slow_cases import slow_but
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.fitting.batched_newton import BLUR
+from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
-from neurocal_cli.detection.markers.lattice import leave_out_strays, place
+from neurocal_cli.detection.markers.lattice import agreement, leave_out_strays, place
 from neurocal_cli.detection.markers.locate import locate
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.detection.medians import upper_median
@@ -102,6 +103,14 @@ def test_codes_that_are_blurred_into_the_edges_leave_the_blur_and_the_noise_of_a
     fitted = fit_with_ink(image, located.grid, 1 / 12, located.ink)
     assert upper_median(fitted.fit.values[:, BLUR]) == pytest.approx(scene.sigma_t, rel=0.03)
     assert fitted.noise.edge == pytest.approx(scene.sensor.read_noise**2 + 1 / 12, rel=0.3)
+
+
+def test_a_grid_without_a_whole_cell_shows_no_codes() -> None:
+    pixels = np.full((2, 3, 2), np.nan)
+    pixels[0] = [[10.0, 10.0], [20.0, 10.0], [30.0, 10.0]]
+    cell, lines = np.zeros((1, 2), dtype=np.int64), np.linspace(0, 1, 5)
+    which, _, agree = agreement(Grid(pixels, 0), cell, lines, np.ones((1, 4, 4)), np.zeros((40, 40)))
+    assert len(which) == len(agree) == 0
 
 
 def test_the_legacy_pattern_is_told_from_the_image() -> None:

@@ -123,7 +123,7 @@ def agreement(
     middle = 0.5 * (lines[1:] + lines[:-1])
     places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
     seen = interpolate(image, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
-    codes = light[which].reshape(len(which), -1)
+    codes = light[which].reshape(len(which), len(places))
     return which, H, (_standard(seen) * _standard(codes)).sum(axis=1)
 
 
