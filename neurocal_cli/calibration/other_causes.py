@@ -27,10 +27,10 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.findings import DETERMINE
+from neurocal_cli.calibration.verdict.findings import DETERMINE, LEVEL
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import causes_among
-from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, NEIGHBOURS, ODD_VIEW
+from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, NEIGHBOURS, ODD_VIEW, SHAPES
 from neurocal_cli.camera.geometry import Array, median
 
 # Of one view. Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean
@@ -88,7 +88,7 @@ def odd_view(solution: Solution) -> str | None:
     """The view that contradicts the others most, or None if no view is odd.
 
     Something that differs between views has to be among the causes of the contest, which does not tell how
-    much a view spoils, and one odd view has to be more probable than a lens of another kind. The
+    much a view spoils, and another lens or target must not be more probable than one odd view. The
     contradiction of a view is the drop in squared error if it had its own camera, per condition that the
     common camera imposes on it. On real boards, which are not quite flat, every view has some tens of that of
     noise; an odd view has to stand out from the others.
@@ -121,8 +121,9 @@ def odd_view(solution: Solution) -> str | None:
     held = contest_of(problem, adjusted, solution.repeated.worth)
     if held is None or all(one.pattern == "all" for one in held.causes):
         return None
-    likelier = causes_among((ODD_VIEW, ANOTHER_LENS), problem, adjusted.state, held.n)
-    return views.names[view] if likelier and likelier[0].rival is ODD_VIEW else None
+    rivals = causes_among((ODD_VIEW, ANOTHER_LENS, *SHAPES), problem, adjusted.state, held.n)
+    odds = next((one.evidence for one in rivals if one.rival is ODD_VIEW), 0.0) + LEVEL
+    return None if any(one.evidence > odds for one in rivals) else views.names[view]
 
 
 def _contradictions(normal: Array, free: NDArray[np.bool_], own: Array) -> Array:

@@ -9,6 +9,7 @@ import pytest
 from support.campaign import scene as campaign_scene
 from support.outliers import MISMATCHES, farthest, good, mismatched, with_outliers
 from support.scenes import pinhole, random_flat_set, table_1
+from support.simulated_targets import draw
 from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
@@ -73,6 +74,14 @@ def test_a_wrong_view_of_ten_changes_nothing_in_many_scenes(distortion: str) -> 
 def test_no_view_is_left_out_unless_a_cause_differs_between_views(seed: int) -> None:
     points, _ = campaign_scene(seed)
     assert not calibrate(points).rejected.views
+
+
+def test_no_view_is_left_out_of_a_board_whose_sides_lean() -> None:
+    one = draw("flat", 41136)  # of five views
+    lean = one.points.world[:, [1, 2, 2]] * 0.03
+    found = calibrate(replace(one.points, world=one.points.world - lean))
+    assert not found.rejected.views
+    assert abs(found.intrinsics.alpha_u - one.truth.K[0, 0]) < 2 * found.std["alpha_u"]
 
 
 @pytest.mark.slow
