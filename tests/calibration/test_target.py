@@ -320,6 +320,18 @@ def test_a_board_at_the_limit_of_stretch_is_kept_when_its_lens_is_chosen_anew(
 
 
 @pytest.mark.slow
+def test_a_board_is_measured_though_the_rays_of_its_lens_do_not_meet(
+    tmp_path: Path, real_files: RealFiles
+) -> None:
+    """As given, its error is 0.36 px, of which such rays explain a third."""
+    words = ["--cols", 6, "--rows", 8, "--square", 32.5, "-o", tmp_path / "points.csv"]
+    assert run("detect", *real_files("fisheye_ocam/*.jpg"), *words).exit_code == 0
+    found = calibrate(read_points(tmp_path / "points.csv"))
+    assert found.target is not None
+    assert found.rmse_px < 0.22
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("images", "cols", "rows", "square", "stretched", "leaning"),
     [

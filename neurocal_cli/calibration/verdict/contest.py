@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.board.prior import STRETCH
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.effects import another_lens, common, field
+from neurocal_cli.calibration.verdict.effects import another_lens, common, field, no_pupil
 from neurocal_cli.calibration.verdict.findings import (
     DETERMINE,
     DISPLACED,
@@ -80,7 +80,10 @@ class Contest:
         first = self.causes[0] if self.causes else None
         if first is None:
             return 0.0
-        others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
+        # A lens whose rays do not meet in one point says nothing against a shape that comes before it.
+        beside = (no_pupil,) if first.rival.of_board else ()
+        known = [one for one in self.causes if not (one.rival.unknown or one.rival.effect in beside)]
+        others = [one.evidence for one in known if not one.rival.of_board]
         told = sum(one.evidence for one in self.causes)
         if max(others, default=0.0) > _MUCH * told or first.rival.unknown or first.pattern == "one":
             return worth * self.evidence - LEVEL

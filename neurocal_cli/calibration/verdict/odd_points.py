@@ -37,6 +37,8 @@ _UNITS = {
     100.0: "metres and centimetres",
     304.8: "feet and millimetres",
     12.0: "feet and inches",
+    39.37: "metres and inches",
+    3.281: "metres and feet",
 }
 OUTLIERS = Limit(0.02, 0.2)
 """Limits of the share of outliers, of all points and of those of a view; clean views lose none."""

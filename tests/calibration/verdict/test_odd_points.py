@@ -11,7 +11,12 @@ from support.wrong_inputs import flat, moved, scaled
 from support.wrong_rigs import scene, seen
 
 from neurocal_cli import Correspondences, calibrate
-from neurocal_cli.calibration.verdict.odd_points import odd_pixels, points_given_twice, views_of_another_scale
+from neurocal_cli.calibration.verdict.odd_points import (
+    odd_pixels,
+    points_given_twice,
+    units_mixed,
+    views_of_another_scale,
+)
 
 POINTS = flat()
 
@@ -130,3 +135,10 @@ def test_a_view_that_is_left_out_with_its_cause_lies_outside_nothing() -> None:
     assert verdict.word == "usable"
     assert len(verdict.reasons) == 1
     assert "right04 (its u and v are exchanged)" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("factor", "units"), [(39.37, "metres and inches"), (1 / 3.281, "metres and feet"), (1.5, "")]
+)
+def test_two_units_are_known_by_their_ratio(factor: float, units: str) -> None:
+    assert units_mixed(factor) == (f", as with {units} mixed" if units else "")
