@@ -245,11 +245,11 @@ def named_cause(
     M[-1, -1] = squares
     try:
         known = Known.of(M, degrees, degrees)
-    except np.linalg.LinAlgError:
+        if ranking := rivals.ranking(known):
+            known = replace(known, n=degrees * rivals.independent(*ranking[0]))
+            ranking = rivals.ranking(known)
+    except np.linalg.LinAlgError:  # the fit did not converge
         return None, rest
-    if ranking := rivals.ranking(known):
-        known = replace(known, n=degrees * rivals.independent(*ranking[0]))
-        ranking = rivals.ranking(known)
     # Of those that are hardly less probable than the first, that which is the first in the list.
     close = likeliest((one[0].evidence, one) for one in ranking)
     found, subject = min(close, key=lambda one: causes.index(one[0].rival), default=(None, 0))

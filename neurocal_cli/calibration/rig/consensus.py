@@ -112,9 +112,10 @@ def all_shifted(problem: RigProblem) -> str:
     return ""
 
 
-def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> tuple[int, int] | None:
-    """The last frame before two cameras have each other's images, and the next one; None if they never have.
+def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> tuple[int, int, int] | None:
+    """How many pairs fit if two cameras have each other's images from some frame on; None if they have not.
 
+    The other results are the last frame before that and the next one.
     `place` (V,) is that of each frame in their sequence. From some place on, the relative poses of both with
     all cameras must be those that the other one had before. That must explain most pairs that contradict the
     rig.
@@ -141,8 +142,9 @@ def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> t
     seen = np.flatnonzero(n_pairs)
     for some in agreed:
         at = int(np.argmax(some))
-        if some[at] - some[-1] >= max(2 * LEAST_AGREED, AGREED * (n_pairs.sum() - some[-1])):
-            return int(seen[seen < at].max(initial=0)), int(seen[seen >= at].min(initial=n - 1))
+        if some[at] - some[-1] > max(2 * LEAST_AGREED, AGREED * (n_pairs.sum() - some[-1])):
+            last, first = seen[seen < at].max(initial=0), seen[seen >= at].min(initial=n - 1)
+            return int(some[at] - some[-1]), int(last), int(first)
     return None
 
 

@@ -20,7 +20,6 @@ derivatives by the rig's unknowns follow from those of each camera by the chain 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,8 +32,6 @@ from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
 from neurocal_cli.adjustment.normal_equations import Covariance, solve_scaled
 from neurocal_cli.adjustment.open_choices import (
-    OpenCoefficients,
-    OpenPrior,
     open_at_points,
     opened,
     spread_of_open,
@@ -139,58 +136,30 @@ def information_of_rig(target: Target, fit: RigFit) -> tuple[Information, Prior]
 
 
 def with_choice(found: Covariance, fit: RigFit) -> Covariance:
-    """Add what the selection of the distortion models leaves open to a covariance of all shared unknowns.
-
-    The models of two cameras are weighed together, those of more cameras camera by camera.
-    """
-    sides = list(range(len(fit.problem.cameras)))
-    for some in [sides] if len(sides) == 2 else [[k] for k in sides]:
-        found = _with_choice_of(found, fit, some)
-    return found
-
-
-def _with_choice_of(found: Covariance, fit: RigFit, sides: Sequence[int]) -> Covariance:
-    """The same for the models of some of the cameras."""
+    """Add what the selection of each camera's distortion model leaves open to that of all shared unknowns."""
     problem, before = fit.problem, fit.state
-    own = [fit.free[place] for place in before.columns.cameras]
-    opened_cameras: list[OpenCoefficients | None] = [None] * len(own)
-    for side in sides:
-        calibration, free = problem.calibrations[side], own[side]
-        # A camera that the common bundle adjustment did not change has no open coefficients either.
-        if free.any():
-            points, choice = calibration.points, tuple(calibration.lens_choice)
-            alone = replace(calibration.state(points.view_names), k=before.cameras[side].k)
-            opened_cameras[side] = open_at_points(alone, points, free, choice)
-    if not any(one is not None for one in opened_cameras):
-        return found
-    cameras = tuple(
-        camera if one is None else one.state(camera)
-        for camera, one in zip(before.cameras, opened_cameras, strict=True)
-    )
-    state = replace(before, cameras=cameras)
-    parts = []
-    for one, free in zip([*opened_cameras, None], [*own, fit.free[-problem.n_rig :]], strict=True):
-        none = np.zeros(int(free.sum()), dtype=bool)
+    for side, place in enumerate(before.columns.cameras):
+        calibration, free = problem.calibrations[side], fit.free[place]
+        if not free.any():  # the common bundle adjustment did not change its coefficients
+            continue
+        points, choice = calibration.points, tuple(calibration.lens_choice)
+        alone = replace(calibration.state(points.view_names), k=before.cameras[side].k)
+        one = open_at_points(alone, points, free, choice)
         if one is None:
-            parts.append((free, none, none))
-        else:
-            parts.append((one.free, one.prior.is_open, one.prior.left_out))
-    all_free, is_open, left_out = (np.concatenate(part) for part in zip(*parts, strict=True))
-    prior = _joined(is_open, left_out, [one.prior for one in opened_cameras if one is not None])
-    arrow = problem.normal(state)[0].only(np.flatnonzero(all_free))
-    spread = spread_of_open(arrow, fit.variance, prior)
-    if spread is None:
-        return found
-    return opened(found, np.flatnonzero(fit.free), arrow, spread, left_out)[0]
-
-
-def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: list[OpenPrior]) -> OpenPrior:
-    """The open coefficients of all cameras, each with groups of its own."""
-    starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
-    groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
-    value, size = (np.concatenate(parts) for parts in zip(*((p.value, p.size) for p in priors), strict=True))
-    odds = tuple(own for prior in priors for own in prior.odds)
-    return OpenPrior(is_open, left_out, value, size, tuple(groups), odds)
+            continue
+        cameras = list(before.cameras)
+        cameras[side] = one.state(cameras[side])
+        first, last = fit.free[: place[0]], fit.free[place[-1] + 1 :]
+        all_free = np.flatnonzero(np.concatenate([first, one.free, last]))
+        its = int(first.sum()) + np.arange(int(one.free.sum()))
+        is_open, left_out = np.zeros((2, len(all_free)), dtype=bool)
+        is_open[its], left_out[its] = one.prior.is_open, one.prior.left_out
+        arrow = problem.normal(replace(before, cameras=tuple(cameras)))[0].only(all_free)
+        prior = replace(one.prior, is_open=is_open, left_out=left_out)
+        spread = spread_of_open(arrow, fit.variance, prior)
+        if spread is not None:
+            found = opened(found, np.flatnonzero(fit.free), arrow, spread, left_out)[0]
+    return found
 
 
 def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:

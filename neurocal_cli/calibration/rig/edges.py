@@ -44,6 +44,9 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 
 _PARTNERS = 4  # cameras with which each camera is compared, those with which it has most frames in common
+_SUSPECTS = (
+    6  # cameras of which two may have been exchanged, those that contradict the largest share of pairs
+)
 
 # Share of the frames of an edge that must agree on one relative pose: where the target moves between late
 # images, only those in which it is slow agree.
@@ -246,24 +249,26 @@ def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
 
 def exchanged_cameras(edges: Sequence[Edge], problem: RigProblem, names: Sequence[str]) -> str:
     """What is wrong where two cameras have each other's images from some frame on; "" if none have."""
-    odd = np.zeros(len(names), dtype=int)
+    n_odd, n_all = np.zeros((2, len(names)), dtype=int)
     for edge in edges:
-        odd[list(edge.cameras)] += len(edge.consensus.reasons) - edge.n_agreed
-    most = np.argsort(-odd, kind="stable")[:_PARTNERS]
-    suspects = sorted(most[odd[most] >= LEAST_AGREED].tolist())
-    if len(suspects) < 2:
-        return ""
+        n_all[list(edge.cameras)] += len(edge.consensus.reasons)
+        n_odd[list(edge.cameras)] += len(edge.consensus.reasons) - edge.n_agreed
+    most = np.argsort(-n_odd / np.maximum(n_all, 1), kind="stable")[:_SUSPECTS]
+    suspects = sorted(most[n_odd[most] >= LEAST_AGREED].tolist())
     word = [next(iter(views.values())) for views in problem.views]
     order = in_sequence(tuple(word))
     place = np.argsort(order)
+    best, told = 0, ""
     for a, b in combinations(suspects, 2):
-        if (found := exchanged(problem, a, b, place)) is not None:
-            last, first = (word[order[k]] for k in found)
-            return (
+        found = exchanged(problem, a, b, place)
+        others = sum(len(e.consensus.reasons) - e.n_agreed for e in edges if {a, b}.isdisjoint(e.cameras))
+        if found is not None and found[0] > max(best, others):
+            best, (last, first) = found[0], (word[order[k]] for k in found[1:])
+            told = (
                 f"the images of cameras {names[a]} and {names[b]} were exchanged between {last} and {first}; "
                 "exchange the names of these cameras in one of the two parts"
             )
-    return ""
+    return told
 
 
 def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list[int]]) -> str:

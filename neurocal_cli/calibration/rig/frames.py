@@ -271,7 +271,7 @@ def check_one_target(points: Mapping[str, Correspondences]) -> None:
         before = seen.setdefault(one.pixels[one.view_index == 0].tobytes(), name)
         if before != name:
             raise InputError(
-                f"cameras {before} and {name} have the same points ({reference.source}, {one.source}); "
+                f"cameras {before} and {name} have the same points ({points[before].source}, {one.source}); "
                 "give the points of each camera once"
             )
     _refuse_moved(points)
