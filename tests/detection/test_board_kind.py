@@ -140,6 +140,21 @@ def test_rows_that_no_image_shows_are_told_by_the_first_number() -> None:
     assert (sure.first_id, sure.rows) == (7, 4)
 
 
+def test_markers_of_other_images_continue_a_board_whose_end_is_not_seen() -> None:
+    for form, cols, seen, last, rows in (
+        ("aprilgrid:6x6:40:0.25", 6, range(18), 35, 6),
+        ("charuco:7x6:40:30:DICT_4X4_50", 7, range(12), 20, 6),
+        ("charuco:8x7:40:30:DICT_4X4_50", 8, range(12), 27, 7),
+    ):
+        lie = lie_of(marks_of(plane_of(form), list(seen)))
+        assert lie is not None
+        numbering = numbered([lie])
+        assert numbering is not None
+        parts = joined(numbering.parts)
+        assert layouts(lie.tags, cols, parts, (0, 0), True, last)[0].rows == rows
+        assert layouts(lie.tags, cols, parts, (0, 0), True)[0].rows < rows
+
+
 def test_markers_that_stand_alone_are_named() -> None:
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     image = cv2.aruco.GridBoard((6, 4), 30.0, 8.0, family).generateImage((1000, 696), None, 60)

@@ -16,14 +16,16 @@ from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.detection.finding.saddles import grey_levels
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
-from neurocal_cli.detection.markers.lattice import agreement, leave_out_strays, place
+from neurocal_cli.detection.markers.lattice import agreement, find_vertices, leave_out_strays, place
 from neurocal_cli.detection.markers.locate import locate
-from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.detection.markers.reading import Marks, numbers_in
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.detection.wide_lens import Flattening, WideLens
@@ -208,6 +210,28 @@ def test_a_marker_that_was_read_wrongly_is_left_out() -> None:
     assert placed is not None
     assert set(placed.marks.number) == set(cells.number) - {3, 4}
     assert place(plane, Marks(number[:1], corners[:1], "DICT_4X4_50")) is None
+
+
+def test_vertices_are_found_some_pixels_from_where_the_markers_say() -> None:
+    """Markers of large images are read at a smaller scale."""
+    plane = plane_of("charuco:4x3:40:30:DICT_4X4_50")
+    picture = taken(marked_scene(plane, 3, square=60.0, tilt=0), 1, 3)
+    (truth,) = picture.truth.planes
+    cells = marked_cells(plane, Print())
+    vertices = np.argwhere(np.isfinite(truth.vertices[..., 0]))[:, ::-1].astype(float)
+    H = homographies(vertices[None], truth.vertices.reshape(1, -1, 2))
+    corners = homography_at(H, cells.corners.reshape(1, -1, 2)).reshape(-1, 4, 2)
+    placed = place(plane, Marks(cells.number, corners + np.array([4.0, -3.5]), "DICT_4X4_50"))
+    assert placed is not None
+    found = find_vertices(plane, placed, grey_levels(picture.image))
+    assert found is not None
+    assert np.abs(found[0].pixels - truth.vertices).max() < 0.3
+
+
+def test_no_quadrangles_have_no_numbers() -> None:
+    """A picture may have no whole tag."""
+    light = np.zeros((40, 40), dtype=np.float32)
+    assert len(numbers_in(light, np.zeros((0, 4, 2)), "DICT_APRILTAG_36h11", 2)) == 0
 
 
 def test_markers_that_fit_both_patterns_tell_nothing() -> None:

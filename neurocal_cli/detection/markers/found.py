@@ -122,7 +122,9 @@ def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> Foun
     parts = joined(numbering.parts)
     above, begins = _beyond(parts, seen, last=False)
     below, stops = _beyond(parts, seen, last=True)
-    possible = layouts(tags, numbering.cols, parts, (above, below), begins)
+    # Where the end of the board is not seen, markers of other images may continue it.
+    last = 0 if stops else max(int(part.lie.marks.number.max()) for part in numbering.parts)
+    possible = layouts(tags, numbering.cols, parts, (above, below), begins, last)
     if not possible:
         raise NoBoardError(
             f"the markers of {dictionary} are numbered as on no ChArUco board or AprilGrid; describe the "

@@ -283,7 +283,7 @@ def _refined(
     for sigma in (1.0, 1.5, 2.5):
         mine = (sigma <= np.maximum(narrow / 6, 1.0)) & np.isfinite(start).all(axis=1)
         if mine.any():
-            refined = refine_saddles(image, start[mine], sigma)
+            refined = refine_saddles(image, start[mine], sigma, rounds=5)
             # Wide windows reach beyond the image earlier.
             new[mine] = np.where(np.isfinite(refined), refined, new[mine])
     moved = np.hypot(*(new - start).T)

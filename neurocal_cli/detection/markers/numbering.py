@@ -248,12 +248,12 @@ def joined(parts: Iterable[Numbered]) -> tuple[Numbered, ...]:
 
 
 def layouts(
-    tags: bool, cols: int, parts: Sequence[Numbered], more: tuple[int, int], begins: bool
+    tags: bool, cols: int, parts: Sequence[Numbered], more: tuple[int, int], begins: bool, last: int = 0
 ) -> list[Layout]:
     """Boards of `cols` columns with the markers of joined parts, the likeliest first.
 
     There are `more` rows before and after those of the parts, and none before these if the board `begins`
-    there.
+    there. The board has at least the rows up to the marker `last`.
     """
     place, at = np.unique(np.concatenate([part.place for part in parts]), axis=0, return_index=True)
     number = np.concatenate([part.lie.marks.number for part in parts])[at]
@@ -267,7 +267,8 @@ def layouts(
             grown = r * cols + c
             first = number - (grown if tags else grown // 2)
             legacy = not tags and int(c[0] + r[0]) % 2 == 0
-            rows = int(r.max()) + 1 + after
+            count = last - int(first.min())
+            rows = 1 + max(int(r.max()) + after, (count if tags else 2 * count) // cols)
             # OpenCV has no legacy boards of an odd number of rows.
             if first.min() >= 0 and (first == first[0]).all() and not (legacy and rows % 2):
                 one = Layout(tags, cols, rows, legacy, int(first[0]))

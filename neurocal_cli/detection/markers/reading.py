@@ -299,7 +299,7 @@ def _matched(light: NDArray[np.bool_], dictionary: str) -> tuple[NDArray[np.int6
     """Numbers (N,) of the markers of a dictionary with these light cells, -1 for none, and quarter turns."""
     known, most = _known_codes(dictionary)
     turned = np.stack([np.rot90(light, turn, axes=(1, 2)) for turn in range(4)])
-    signs = np.where(turned, np.float32(1), np.float32(-1)).reshape(4, len(light), -1)
+    signs = np.where(turned, np.float32(1), np.float32(-1)).reshape(4, len(light), known.shape[1])
     agree = signs @ known.T  # cells less twice the wrong ones
     nearest = agree.argmax(axis=2)
     agreed = np.take_along_axis(agree, nearest[..., None], axis=2)[..., 0]
