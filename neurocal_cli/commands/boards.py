@@ -35,6 +35,7 @@ _SELDOM = 0.2  # ratio of images with the described size to those with another; 
 _COMPARED = 3  # images, with a described board with markers
 _PICTURES = (".pdf", ".svg", ".png", ".jpg", ".jpeg")
 _USUAL_SIDES = 1.0, 2000.0  # mm, of squares
+_OFF_SPACING = 0.05  # of the distance of tags, which images tell to a few thousandths
 _FEW = 3  # images; fewer may by chance show the same part of the board
 
 
@@ -224,8 +225,8 @@ def board_in_images(paths: Sequence[str], given: BoardOptions, enough: int) -> B
 def compare_markers(paths: Sequence[str], board: Board) -> None:
     """Compare a described board of one plane with markers with what some of the images show.
 
-    It is a NeurocalError if they show other columns, whose markers would be called wrongly, or another kind;
-    of more or fewer rows, a warning.
+    It is a NeurocalError if they show other columns, whose markers would be called wrongly, another spacing
+    of tags or another kind; of more or fewer rows, a warning.
     """
     from neurocal_cli.detection.markers.found import agreed_markers, seen_markers
     from neurocal_cli.detection.placement import NoBoardError
@@ -246,7 +247,10 @@ def compare_markers(paths: Sequence[str], board: Board) -> None:
         return
     shown = found.plane
     told = f"the images show {found_words(shown)}; the board was described otherwise"
-    if isinstance(shown, TagPlane) != isinstance(plane, TagPlane) or shown.cols != plane.cols:
+    other = isinstance(shown, TagPlane) != isinstance(plane, TagPlane) or shown.cols != plane.cols
+    if isinstance(shown, TagPlane) and isinstance(plane, TagPlane):
+        other |= abs(shown.spacing - plane.spacing) > _OFF_SPACING * (1 + shown.spacing)
+    if other:
         raise NoBoardError(f"{told}: correct its description, or leave it out")
     if found.sure and shown.rows != plane.rows:
         warn(f"{told}: it has another number of rows")

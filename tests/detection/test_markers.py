@@ -174,6 +174,29 @@ def test_a_board_of_other_columns_is_refused_although_two_markers_agree(form: st
         detect_points(taken(scene, 2).image, Board((plane_of(form),)))
 
 
+@pytest.mark.parametrize(
+    ("form", "reason"),
+    [
+        ("arucogrid:4x3:30:0.25:DICT_6X6_50", "as if it had another number of columns"),
+        ("arucogrid:6x3:30:0.25:DICT_6X6_50", "as if it had another number of columns"),
+        ("arucogrid:5x3:30:0.4:DICT_6X6_50", "gap between two markers is about 0.2.*correct its spacing"),
+    ],
+)
+def test_markers_that_stand_alone_otherwise_than_described_are_refused(form: str, reason: str) -> None:
+    scene = marked_scene(plane_of("arucogrid:5x3:30:0.25:DICT_6X6_50"), 2, 40.0)
+    with pytest.raises(NoBoardError, match=reason):
+        detect_points(taken(scene, 2, 3).image, Board((plane_of(form),)))
+
+
+def test_a_board_with_no_whole_marker_shows_no_code() -> None:
+    grid = Grid(np.full((3, 3, 2), np.nan), 0)
+    codes, lines = np.ones((1, 4, 4)), np.linspace(0.2, 0.8, 5)
+    which, _, agree = agreement(
+        grid, np.zeros((1, 2), dtype=np.int64), lines, codes, np.zeros((9, 9), np.float32)
+    )
+    assert len(which) == len(agree) == 0
+
+
 def test_too_many_markers_for_a_dictionary_are_refused() -> None:
     board = Board((plane_of("charuco:12x10:40:30:DICT_4X4_50"),))
     with pytest.raises(InputError, match="markers up to 59, and DICT_4X4_50 up to 49"):

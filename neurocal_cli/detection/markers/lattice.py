@@ -56,6 +56,7 @@ class Placed:
     cells: Cells
     at: NDArray[np.intp]  # (N,) their positions among the cells
     ground: Array  # (N, 4, 2) [squares] their corners on the board
+    read: int  # how many of the board's markers were read
     unsure: bool = False  # whether as many markers agree in another print
 
 
@@ -72,7 +73,7 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
         if len(kept) < 2:
             continue
         if best is None or len(kept) > len(best.at):
-            best = Placed(some.only(kept), how, cells, at[kept], ground[kept])
+            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], len(at))
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
     return best
