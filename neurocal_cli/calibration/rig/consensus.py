@@ -142,9 +142,10 @@ def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> t
     seen = np.flatnonzero(n_pairs)
     for some in agreed:
         at = int(np.argmax(some))
-        if some[at] - some[-1] > max(2 * LEAST_AGREED, AGREED * (n_pairs.sum() - some[-1])):
+        gained = int(some[at] - some[-1])
+        if gained >= 2 * LEAST_AGREED and gained > AGREED * (n_pairs.sum() - some[-1]):
             last, first = seen[seen < at].max(initial=0), seen[seen >= at].min(initial=n - 1)
-            return int(some[at] - some[-1]), int(last), int(first)
+            return gained, int(last), int(first)
     return None
 
 

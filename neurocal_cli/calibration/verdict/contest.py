@@ -30,7 +30,7 @@ from neurocal_cli.calibration.verdict.findings import (
     or_else,
 )
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
-from neurocal_cli.calibration.verdict.rival import Estimate, Rival, Told, estimates, including
+from neurocal_cli.calibration.verdict.rival import Estimate, Known, Rival, Told, estimates, including
 from neurocal_cli.calibration.verdict.rivals import (
     ANOTHER_LENS,
     EFFECTS,
@@ -56,7 +56,7 @@ class Contest:
     """The causes that explain the residuals of a camera, the first one found first."""
 
     lin: Linearised
-    causes: tuple[Estimate, ...]  # that were included in turn
+    causes: tuple[Estimate, ...]  # that were included in turn, each with what it changes beside those before
     close: tuple[tuple[Estimate, ...], ...]  # rivals that are hardly less probable, of each cause
     explained: float  # share of the squared error that all of them explain
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
@@ -164,6 +164,7 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
     share = n / lin.spare
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
     causes: list[Estimate] = []
+    before = np.zeros(len(lin.free))  # change of the camera by the causes so far
     close: list[tuple[Estimate, ...]] = []
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _likeliest_first(ranking)
@@ -171,11 +172,12 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
         far = not chosen[0].weights.size or chosen[0].rival.cause in fitted
         least = max(least, (_FAR if far else _MINOR) * chosen[0].evidence)
         for one in chosen:
-            causes.append(one)
+            causes.append(replace(one, camera=one.camera[: len(before)] - before))
             alone = one is ranking[0]
             close.append(tuple(x for x in ranking[1:] if alone and x.evidence > one.evidence - LEVEL))
             evidence, left = evidence + one.evidence, left * (1.0 - one.explained)
             at = including(at, one)
+            before = Known.at(at, at.spare).right[: len(before)]
         ranking = estimates(at, at.spare * share, _others(causes, rivals))
     # As an estimated target counts it: all residuals as independent.
     evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
@@ -373,7 +375,8 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0
     )
-    return max(grade, _BIASED.grade(max(biased, default=0.0))), reason
+    by_bias = _BIASED.grade(max(biased, default=0.0))
+    return max(grade, min(by_bias, 1) if found.rival.of_distance else by_bias), reason
 
 
 def _is_another(found: Estimate, other: Estimate) -> bool:

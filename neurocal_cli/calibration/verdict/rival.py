@@ -77,7 +77,7 @@ class Told:
     def biases(self) -> dict[str, float]:
         """Changes of the focal lengths and the centre with this cause [px]."""
         names = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
-        by = zip(self.lin.free.tolist(), self.found.camera.tolist(), strict=False)  # earlier causes come last
+        by = zip(self.lin.free.tolist(), self.found.camera.tolist(), strict=False)
         return {names[k]: one * self.lin.views.pixel_scale for k, one in by if k in names}
 
     @property
@@ -121,6 +121,7 @@ class Rival(Cause[Told]):
     effect: Effect | None = None
     steps: Steps | None = None
     of_given: bool = False  # a given value
+    of_distance: bool = False  # the camera is that of the distance of its targets, and no other is right
     of_board: bool = False  # the shape of the target, which is usually estimated
     unknown: bool = False  # no cause, but what is left if none is known
 
@@ -143,15 +144,14 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
     `n` is the effective number of equations beyond the unknowns. Rivals that cannot reach the `least`
     evidence are left out. Raises `numpy.linalg.LinAlgError` if the views do not determine the camera.
     """
-    kept = np.append(lin.free, lin.width)
-    known = Known.of(lin.R[:, kept[:, None], kept].sum(axis=0), n)
+    known = Known.at(lin, n)
     best: dict[str, Estimate] = {}
     for rival in rivals:
         steps = rival.steps_at(lin)
         if not steps.size or not known.cost > 0:
             continue
         X = steps.T @ lin.R[:, :-1]  # (V, m, c + 1)
-        S, along = X[:, :, :-1] @ steps, X[:, :, kept]
+        S, along = X[:, :, :-1] @ steps, X[:, :, np.append(lin.free, lin.width)]
         absorbed = ABSORBED * lin.before @ steps[: lin.before.shape[1]] ** 2  # (V, m)
         its = Unknowns(rival, S, along, absorbed)
         shared = rival.patterns and rival.patterns(lin, S, along[:, :, -1])
@@ -206,6 +206,12 @@ class Known:
     right: Array  # (f,) the step to the minimum
     cost: float
     least: float  # squared error that noise leaves at least
+
+    @classmethod
+    def at(cls, lin: Linearised, n: float) -> Known:
+        """Of a camera at its minimum, or with causes that are included."""
+        kept = np.append(lin.free, lin.width)
+        return cls.of(lin.R[:, kept[:, None], kept].sum(axis=0), n)
 
     @classmethod
     def of(cls, M: Array, n: float, least: float = 0.0) -> Known:

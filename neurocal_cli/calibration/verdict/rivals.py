@@ -186,13 +186,11 @@ RIVALS: tuple[Rival, ...] = (
         "rays that do not meet in one point",
         "residuals around the centre that are others for near targets than for far ones",
         "photograph the target at the distances at which you measure",
-        words.plain(
-            "near and far targets do not fit one camera, by {px} px rms: the rays do not meet in one point, "
-            "as in a wide lens, or behind a flat window under water"
-        ),
+        words.no_pupil,
         DISPLACED,
         effects.common,
         effect=effects.no_pupil,
+        of_distance=True,
     ),
     Rival(
         RICHER_LENSES[0].cause,

@@ -188,10 +188,24 @@ def deformed(told: Told) -> Said:
     return _on_board(told, f"a target of another shape, {shape}", "target")
 
 
+def no_pupil(told: Told) -> Said:
+    """Rays that meet the axis of the lens in other points."""
+    return (
+        f"near and far targets do not fit one camera, by {told.displaced:.2g} px rms, which {_makes(told)}: "
+        "the rays do not meet in one point, as in a wide lens, or behind a flat window under water",
+        told.displaced / told.diagonal,
+    )
+
+
 def _on_board(told: Told, shape: str, where: str = "board") -> Said:
-    off = told.longer
-    makes = f"makes the focal length {percent(abs(off))} too {'short' if off > 0 else 'long'}"
-    return f"the residuals repeat on the {where} in all views: it seems {shape}, which {makes}", abs(off)
+    return (
+        f"the residuals repeat on the {where} in all views: it seems {shape}, which {_makes(told)}",
+        abs(told.longer),
+    )
+
+
+def _makes(told: Told) -> str:
+    return f"makes the focal length {percent(abs(told.longer))} too {'short' if told.longer > 0 else 'long'}"
 
 
 def bent_view(told: Told) -> Said:

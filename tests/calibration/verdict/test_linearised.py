@@ -15,6 +15,7 @@ from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict import effects
+from neurocal_cli.calibration.verdict.contest import _held
 from neurocal_cli.calibration.verdict.effects import common
 from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen, linearised
@@ -116,6 +117,21 @@ def drifting() -> Linearised:
     noise = 0.1 * np.random.default_rng(1).standard_normal(points.pixels.shape)
     pixels = state.entries[0, 3:] + (points.pixels - state.entries[0, 3:]) * share[:, None] + noise
     return at(replace(points, pixels=pixels), state, 5)[0]
+
+
+def test_a_further_cause_is_told_with_what_it_changes_beside_the_first() -> None:
+    points, state = exact()
+    from_middle = np.linalg.norm(points.world - points.world.mean(axis=0), axis=1)
+    pixels = state.entries[0, 3:] + (points.pixels - state.entries[0, 3:]) * (
+        1.0 + 0.003 * (from_middle / from_middle.max())[:, None] ** 2
+    )
+    noise = 0.03 * np.random.default_rng(1).standard_normal(pixels.shape)
+    in_blocks = 0.2 * np.cos(2 * np.pi * (points.pixels + 0.5) / 8)
+    lens, codec, _ = _held(
+        at(replace(points, pixels=pixels + noise + in_blocks), state, 5)[0], 1.0, RIVALS
+    ).causes
+    assert (lens.rival.cause, codec.rival.cause) == ("a lens that is too simple", "a video codec")
+    assert abs(codec.camera[0]) < 0.3 * abs(lens.camera[0])
 
 
 def of_cause(lin: Linearised, cause: str) -> Estimate:

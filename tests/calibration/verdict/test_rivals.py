@@ -306,7 +306,10 @@ def test_rays_that_do_not_meet_in_one_point_are_told(seed: int, shift: float) ->
     moved = scene.camera.project(seen)[0] - scene.camera.project(X)[0]
     central, found = calibrate(scene.points), calibrate(displaced(scene.points, moved))
     assert not reasons(central)
+    assert found.verdict is not None
+    assert found.verdict.word == "usable"
     assert reasons(found).startswith("near and far targets do not fit one camera")
+    assert "which makes the focal length" in reasons(found)
 
 
 def curled(by: float, seed: int, n: int = 14) -> Calibration:
