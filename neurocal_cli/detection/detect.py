@@ -147,6 +147,8 @@ def detect_points(
     measured = tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
     count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
     if count < _FEWEST:
+        if not rejected:
+            raise NoBoardError(f"only {count} points of the board are seen; show more of it")
         share = f"{count} of {count + rejected} points"
         raise NoBoardError(f"only {share} of the board can be measured; take a sharper or nearer image")
     labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
