@@ -16,7 +16,7 @@ HEAD = "| cause | what the data look like | shared by | advice |\n| --- | --- | 
 def table() -> str:
     """One row for each cause of a camera, of its rows, of a rig, of matches and of a zoom lens."""
     sys.path[:0] = [str(ROOT)]
-    from neurocal_cli.calibration.rig import causes, triangulation
+    from neurocal_cli.calibration.rig import causes, match_mistakes
     from neurocal_cli.calibration.verdict import effects
     from neurocal_cli.calibration.verdict.mistakes import MISTAKES
     from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, RIVALS
@@ -33,7 +33,7 @@ def table() -> str:
     rows += [(one, "one view, or all") for one in MISTAKES]
     rows += [(one, f"{'all cameras' if one.of_all else 'a camera'} of a rig") for one in causes.CAUSES]
     rows.append((causes.MIXED_UNITS, "all cameras of a rig"))
-    rows += [(one, "all matches") for one in triangulation.MISTAKES]
+    rows += [(one, "all matches") for one in match_mistakes.MISTAKES]
     rows += [(one, f"{'one setting' if one.of_one else 'all settings'}") for one in judgement.CAUSES]
     told = dict.fromkeys(f"| {one.cause} | {one.looks} | {who} | {one.advice} |\n" for one, who in rows)
     return HEAD + "".join(told)

@@ -321,7 +321,7 @@ class _Tally:
                 "-o RESIZED.yaml"
             )
         if self.off + self.behind > _MANY_OFF * self.points:
-            from neurocal_cli.calibration.rig.triangulation import fault_of_matches
+            from neurocal_cli.calibration.rig.match_mistakes import fault_of_matches
 
             assert self.first is not None
             left, right = self.first[:_SAMPLE, :2], self.first[:_SAMPLE, 2:]

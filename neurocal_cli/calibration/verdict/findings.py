@@ -1,7 +1,7 @@
 """The parts of a verdict: findings with a grade, a reason and advice, causes, and limits for the grades.
 
 A cause is a value with its words, whether it is one of a camera (`rivals`), of the rows of a file
-(`mistakes`), of a rig (`rig.causes`), of matches (`rig.triangulation`) or of a zoom lens (`zoom.judgement`).
+(`mistakes`), of a rig (`rig.causes`), of matches (`rig.match_mistakes`) or of a zoom lens (`zoom.judgement`).
 """
 
 from __future__ import annotations

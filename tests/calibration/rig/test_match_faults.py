@@ -12,8 +12,8 @@ from support.command_line import run
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import Pose, StereoRig, write_rig
+from neurocal_cli.calibration.rig.match_mistakes import fault_of_matches
 from neurocal_cli.calibration.rig.rectification import rectified_pair
-from neurocal_cli.calibration.rig.triangulation import fault_of_matches
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.exchange.format_table import CameraSet
 from neurocal_cli.files.exchange.neurocal import as_stereo
