@@ -213,10 +213,8 @@ def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
 def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidate]:
     """Sound models; the other monotonic ones as well if they predict much better.
 
-    A single view cannot tell that, because errors of the target are common to all of its folds. A model whose
-    coefficients the points do not determine would be refused.
+    A single view cannot tell that, because errors of the target are common to all of its folds.
     """
-    fitted = {name: c for name, c in fitted.items() if c.determined} or fitted
     monotonic = {name: c for name, c in fitted.items() if c.not_monotonic is None} or fitted
     sound = {name: c for name, c in monotonic.items() if c.sound}
     if not sound or not several:
