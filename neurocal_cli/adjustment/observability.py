@@ -16,7 +16,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 # Repeated by test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
 # matrix.
 _COLLINEAR = 1e-6  # second extent as a share of the first
-_SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
+SINGULAR = 1e-13
+"""Eigenvalue of a normal matrix with unit diagonal, below which it is rounding."""
 # Largest std of a focal length over its value. Noisy parallel boards fit best with tilts of about one
 # standard deviation each, and V of them then seem to determine the focal length to 1 / sqrt(2 V). The std of
 # flat targets must be below that, times this factor.
@@ -127,7 +128,7 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
     is not below the limit.
     """
     views, relative_std = problem.views, relative_std_of_scale(problem, state, cov)
-    singular = not cov.smallest > _SINGULAR
+    singular = not cov.smallest > SINGULAR
     boards = views.nearly_flat.all() and problem.free_poses and problem.free[[0, 2]].any()
     limit = MEANINGLESS / np.sqrt(2 * views.n_views) if boards else MEANINGLESS
     if not singular and relative_std < limit:

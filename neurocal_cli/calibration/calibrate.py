@@ -302,6 +302,10 @@ def _solved(
 
         solution, rejected = with_target(problem, solution, rejected, options, choice)
         solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
+    if options.distortion == "auto":
+        from neurocal_cli.calibration.lens_choice.model_selection import with_determined_lens
+
+        solution = with_determined_lens(solution)
     if solution.state.model in WITH_XI:
         from neurocal_cli.calibration.lens_choice.xi_profile import with_all_minima
 

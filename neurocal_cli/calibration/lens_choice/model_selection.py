@@ -25,6 +25,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.find import Found, find_target
 from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
+from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.residual_correlation import point_residuals
@@ -59,11 +60,15 @@ _SIMPLER = -1.0  # and for a simpler one
 _PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
 
 
-def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
+def select_model(
+    solution: Solution, more_starts: Starts | None = None, preferred: str = "", determined: bool = False
+) -> Solution:
     """Fit all models, starting from a solution with any of them, and select one.
 
     `more_starts` are tried in case the first one leads to a local minimum. The `preferred` model is selected
-    unless another predicts decidedly better. The result has the cross-validation errors of all fitted models.
+    unless another predicts decidedly better. If it is to be `determined`, models whose coefficients the
+    points do not determine are selected only if there is no other. The result has the cross-validation errors
+    of all fitted models.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
@@ -78,7 +83,8 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     if not repeated.none:
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
-    name, good = _best(fitted, views, repeated)
+    told = {model: c for model, c in fitted.items() if c.determined} if determined else {}
+    name, good = _best(told or fitted, views, repeated)
     chosen = fitted[preferred if preferred in good else name]
     n, px = len(views.index), views.pixel_scale
     iterations = solution.adjusted.iterations + chosen.adjusted.iterations
@@ -88,6 +94,17 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
         adjusted=replace(chosen.adjusted, iterations=iterations),
         model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
     )
+
+
+def with_determined_lens(solution: Solution) -> Solution:
+    """Select again among the models whose coefficients the points determine, if they do not for this one.
+
+    It is asked once points are left out: to find outliers, the lens that follows the points best serves,
+    determined or not.
+    """
+    if solution.covariance.smallest > SINGULAR:
+        return solution
+    return select_model(solution, determined=True)
 
 
 def _with_other_starts(

@@ -326,7 +326,8 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         if place and small and found.evidence < _UNCLEAR * LEVEL:
             continue  # it may be what a cause leaves that is too small to be told
         small = small and not grade
-        yield grade, reason + or_else(names), found.rival.advice
+        advice = (found.rival.of_selected if calibration.lens_choice else "") or found.rival.advice
+        yield grade, reason + or_else(names), advice
 
 
 def _likelier_than_not(contest: Contest, told: list[Estimate], calibration: Calibration) -> Estimate:

@@ -123,6 +123,7 @@ class Rival(Cause[Told]):
     of_given: bool = False  # a given value
     of_distance: bool = False  # the camera is that of the distance of its targets, and no other is right
     of_board: bool = False  # the shape of the target, which is usually estimated
+    of_selected: str = ""  # other advice where the lens was selected
     unknown: bool = False  # no cause, but what is left if none is known
 
     def steps_at(self, lin: Linearised) -> Array:

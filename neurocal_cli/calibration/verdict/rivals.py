@@ -17,6 +17,7 @@ CHANGED = Limit(0.002, 0.05)
 """Limits of a change of the focal length or the centre, over the focal length; a result has half of it."""
 SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
 """Advice where it is wrong."""
+_TO_CORNERS = "add views with points nearer to the image's corners, by which a richer lens can be selected"
 _BLOCKS = (8, 16)  # sizes of the blocks of video codecs [px]
 _FIXED = "keep zoom and focus fixed, autofocus off, and all images at one size"
 _APART_ADVICE = "calibrate these views and the others separately, and give all images as they were stored"
@@ -33,6 +34,7 @@ RICHER_LENSES = tuple(
         DISPLACED,
         effects.common,
         steps=effects.lens(model),
+        of_selected=_TO_CORNERS,
     )
     for model in (*POLYNOMIAL_MODELS[1:], "rational", "omnidir")
 )

@@ -100,6 +100,13 @@ def test_a_model_that_lost_its_way_is_fitted_from_a_better_one(seed: int) -> Non
     assert judged("k1k2p1p2", seed)[1]
 
 
+def test_a_lens_that_the_points_do_not_determine_is_not_selected_in_the_end() -> None:
+    points, truth = campaign_scene(41133)  # a rational lens predicts best, and would be refused
+    found = calibrate(points)
+    assert found.distortion_model == "plumb_bob"
+    assert abs(found.intrinsics.alpha_u - truth.A[0, 0]) < 3.0 * found.std["alpha_u"]
+
+
 @pytest.mark.parametrize("seed", [23, 43])
 def test_of_three_views_none_can_be_spared_to_choose_a_lens(seed: int) -> None:
     scene, _ = bent_set("k1k2", seed)
