@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import nullcontext
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,6 @@ import click
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.streams import note, noted, print_summary, say, warn, warned
 from neurocal_cli.errors import InputError, UsageError, plural
-from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -176,8 +174,7 @@ def convert(
     target_board = (board if described else replace(board, unit=None)).read()
     from neurocal_cli.files.exchange.format_table import CameraSet
 
-    with repeatable_stdin() if "-" in files else nullcontext():
-        found = _read(files, target_board, board.unit, image_size, distortion, what)
+    found = _read(files, target_board, board.unit, image_size, distortion, what)
     if isinstance(found, CameraSet):
         if form == "lensfun" and focal_length is crop_factor is None:
             raise UsageError("--to lensfun needs --focal-length, --crop-factor, or both")

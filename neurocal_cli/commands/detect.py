@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -35,7 +34,6 @@ from neurocal_cli.commands.streams import (
 )
 from neurocal_cli.errors import NeurocalError, UsageError
 from neurocal_cli.files.image_files import find_images, stated_sizes, view_names
-from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -176,11 +174,10 @@ def detect(
     described, enough = described_board(board), 1 if watch is None else _ENOUGH
     wanted = _Request(described, board, cast("Points", points), gamma, overlay is not None, cache, enough)
     outputs = (output, save_board)
-    with repeatable_stdin() if described is None and "-" in images else nullcontext():
-        if watch is None:
-            outcomes = _examined(images, wanted, outputs, overlay, jobs, frames)
-        else:
-            outcomes = _watched(images, wanted, outputs, watch)
+    if watch is None:
+        outcomes = _examined(images, wanted, outputs, overlay, jobs, frames)
+    else:
+        outcomes = _watched(images, wanted, outputs, watch)
     outcomes, target = of_one_size(outcomes), wanted.board
     assert target is not None
     _report(outcomes, target, as_json)

@@ -98,8 +98,6 @@ def _read(name: str) -> Calibration | Camera | Rig:
             return rig_from_field(root)
         camera: Calibration | Camera = calibration_from_field(root)
     except FormatError:
-        if name == "-":
-            raise
         camera = read_given_camera(name)
     if not (isinstance(camera, Calibration) and camera.known_covariance[0]):
         note(f"{name} does not say how accurate its camera is, so it is taken as exact")

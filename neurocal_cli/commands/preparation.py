@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -98,19 +97,17 @@ def given_points(*names: str, board: str | None = "") -> Correspondences:
     Corners without their places need a board, its file or a short form; "" is that of a command without one.
     """
     from neurocal_cli.files.points_csv import POINTS, TABLES, ids_at_two_places, read_points
-    from neurocal_cli.files.reading import repeatable_stdin
 
     notes: list[str] = []
-    with repeatable_stdin() if "-" in names else nullcontext():
-        points = None
-        if board or not names[0].lower().endswith(TABLES):
-            from neurocal_cli.files.exchange.corners import BOARD_ADVICE, read_corners
+    points = None
+    if board or not names[0].lower().endswith(TABLES):
+        from neurocal_cli.files.exchange.corners import BOARD_ADVICE, read_corners
 
-            advice = POINTS.instead.removeprefix("; ") if board == "" else BOARD_ADVICE
-            described = boards.named_board(board) if board else None
-            points = read_corners(names, described, notes, what="points", advice=advice)
-        if points is None:
-            points = read_points(names, notes=notes)
+        advice = POINTS.instead.removeprefix("; ") if board == "" else BOARD_ADVICE
+        described = boards.named_board(board) if board else None
+        points = read_corners(names, described, notes, what="points", advice=advice)
+    if points is None:
+        points = read_points(names, notes=notes)
     note(*notes, *ids_at_two_places(points))
     return points
 
@@ -161,7 +158,7 @@ def calibration_or_camera(
     try:
         return read_calibration(name), points
     except FormatError as error:
-        if points is None or name == "-":
+        if points is None:
             raise
         try:
             points, camera = given_camera(name, points)

@@ -94,7 +94,7 @@ def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs:
 
     files = {}
     for name in inputs:
-        if name is not None and name != "-":  # what came through a pipe is gone
+        if name is not None:
             data, source = read_bytes(name)
             files[source] = hashlib.sha256(data).hexdigest()
     typed = click.get_current_context().meta.get(TYPED, ())

@@ -229,7 +229,7 @@ def _scene(camera_file: str | None, board_file: str | None, views: int | None, s
         from neurocal_cli.camera.camera import camera_of
         from neurocal_cli.files.calibration_yaml import read_calibration
 
-        own = board_file is None and views is None and camera_file != "-"
+        own = board_file is None and views is None
         if own:
             with suppress(FormatError):
                 return scenes.calibrated_scene(read_calibration(camera_file))

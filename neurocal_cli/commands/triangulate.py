@@ -217,7 +217,7 @@ def _of_many(rig: str, matches: str) -> bool:
     from neurocal_cli.files.camera_tree import own_kind, read_tree
     from neurocal_cli.files.measurement_csv import has_sightings
 
-    return has_sightings(matches) or (rig != "-" and own_kind(read_tree(rig)) == "rig")
+    return has_sightings(matches) or own_kind(read_tree(rig)) == "rig"
 
 
 def _triangulate_many(

@@ -63,8 +63,8 @@ class Sightings:
 
 
 def has_sightings(path: str | Path) -> bool:
-    """Whether the header of a file names a camera and one pixel in each row; not for standard input."""
-    if str(path) == "-":
+    """Whether the header of a file names a camera and one pixel in each row; False for stdin and pipes."""
+    if not Path(path).is_file():
         return False
     head = next(iter(read_blocks(path, _HEADER)), b"").decode("utf-8", "replace")
     return {"camera", "u", "v"} <= set(column_names(head, SIGHTINGS))

@@ -9,7 +9,6 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from typing import IO
 
@@ -25,24 +24,19 @@ _WIDE_MARKS = (
     (b"\xfe\xff", "UTF-16"),
 )
 _STDIN = "<stdin>"
-# All of stdin within `repeatable_stdin`.
-_KEPT: ContextVar[bytes | None] = ContextVar("stdin", default=None)
-
-
-@contextmanager
-def repeatable_stdin() -> Iterator[None]:
-    """Keep what is read from stdin, so that several readers can look at it in turn."""
-    token = _KEPT.set(read_bytes("-")[0])
-    try:
-        yield
-    finally:
-        _KEPT.reset(token)
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
-    """Read a whole file, or stdin for ``-``, and its name for messages."""
+    """Read a whole file, or stdin for ``-``, and its name for messages.
+
+    A command may read stdin and pipes again: several readers look at a file in turn.
+    """
     with _opened(path) as (file, source):
-        return _read(file, source), source
+        data = _read(file, source)
+        outputs = held_back()
+        if outputs is not None and (source == _STDIN or not file.seekable()):
+            outputs.read[str(path)] = data
+    return data, source
 
 
 def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
@@ -63,15 +57,17 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
 def _opened(path: str | Path) -> Iterator[tuple[IO[bytes], str]]:
     """A file, or stdin or what was kept of it, and its name; the current command may not overwrite it."""
     outputs = held_back()
-    if str(path) == "-":
+    source = _STDIN if str(path) == "-" else one_line(path)
+    if outputs and str(path) in outputs.read:
+        yield io.BytesIO(outputs.read[str(path)]), source
+        return
+    if source == _STDIN:
         if outputs:
             outputs.protect("-")
-        kept = _KEPT.get()
-        with _failures(_STDIN):
-            file = sys.stdin.buffer if kept is None else io.BytesIO(kept)
-        yield file, _STDIN
+        with _failures(source):
+            file = sys.stdin.buffer
+        yield file, source
         return
-    source = one_line(path)
     with _failures(source):
         opened = open(path, "rb")  # noqa: SIM115 - errors of the caller must not count as reading failures
     with opened:

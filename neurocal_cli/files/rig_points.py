@@ -43,7 +43,7 @@ def read_rig_points(
     found: dict[str, Correspondences | list[Table]] = {}
     for name, path in files:
         corners = None
-        if path != "-" and (board is not None or not path.lower().endswith(TABLES)):
+        if board is not None or not path.lower().endswith(TABLES):
             corners = read_corners([path], board, remarks, what="points", advice=BOARD_ADVICE)
         if corners is not None:
             if found.setdefault(name or Path(path).stem, corners) is not corners:

@@ -271,7 +271,7 @@ def decimal_commas(found: int, expected: int, separator: str | None) -> str:
     """Advice for a row with too many values because its decimal commas separate them too; "" for others."""
     if separator != "," or found < _COMMAS * expected:
         return ""
-    return "write decimal points if these are decimal commas, or separate the values by semicolons"
+    return "write decimal points if these are decimal commas"
 
 
 def _headerless_names(

@@ -182,6 +182,7 @@ class Outputs:
         self._staged: list[tuple[str, str, str]] = []
         self._folders: list[str] = []
         self._stdout: list[bytes] = []
+        self.read: dict[str, bytes] = {}  # stdin and pipes by their names, which can be read only once
         self.written: list[str] = []  # files that have got their contents, as they were named
 
     def protect(self, *paths: str | None) -> None:

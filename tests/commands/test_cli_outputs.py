@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
+from threading import Thread
 
 import pytest
 from support.command_line import run
@@ -20,6 +22,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     for name in ("flat.csv", "board01.png", "matches.csv", "stereo_left.csv", "stereo_right.csv"):
         (folder / name).write_bytes((SAMPLES / name).read_bytes())
+    (folder / "points").write_bytes((folder / "flat.csv").read_bytes())
     quick = ("--no-skew", "--distortion", "none", "--outliers", "keep")
     assert run("calibrate", folder / "flat.csv", *quick, "-o", folder / "camera.yaml").exit_code == 0
     left, right = folder / "stereo_left.csv", folder / "stereo_right.csv"
@@ -59,6 +62,37 @@ def test_a_command_after_one_that_failed_says_that_its_input_is_empty(words: tup
     result = run(*words, stdin=b"")
     assert result.exit_code == 1
     assert result.stderr == "Error: <stdin>: is empty; check the command before it\n"
+
+
+@pytest.mark.skipif(not Path("/dev/fd").exists(), reason="pipes have no names here")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("calibrate", "points", "--distortion", "none", "--outliers", "keep"),
+        ("detect", "board01.png", "--square", 25),
+        ("convert", "camera.yaml", "--to", "json"),
+        ("triangulate", "rig.yaml", "matches.csv"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_pipe_in_place_of_a_file_is_read_like_it(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    def pour(end: int, content: bytes) -> None:
+        with open(end, "wb") as file:
+            file.write(content)
+
+    with ExitStack() as pipes:
+        for path in made.iterdir():
+            if path.name in words:
+                reader, writer = os.pipe()
+                pipes.callback(os.close, reader)
+                os.symlink(f"/dev/fd/{reader}", tmp_path / path.name)
+                Thread(target=pour, args=(writer, path.read_bytes()), daemon=True).start()
+        monkeypatch.chdir(tmp_path)
+        result = run(*words)
+    monkeypatch.chdir(made)
+    assert (result.stderr, result.stdout) == ((expected := run(*words)).stderr, expected.stdout)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

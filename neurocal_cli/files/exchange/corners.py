@@ -68,10 +68,10 @@ def read_corners(
 ) -> Correspondences | None:
     """Read points from files of any program; None if the first file has no points.
 
-    The files are one, or board points and then a file for each view; stdin has to be repeatable
-    (`repeatable_stdin`). `board` gives the board points, and `unit` theirs, if the files do not; without them
-    the error ends in `advice`. Remarks about ignored columns are appended to `notes`. A file with a camera as
-    well is left to it, unless `what` is "points".
+    The files are one, or board points and then a file for each view; stdin counts only within a command.
+    `board` gives the board points, and `unit` theirs, if the files do not; without them the error ends in
+    `advice`. Remarks about ignored columns are appended to `notes`. A file with a camera as well is left to
+    it, unless `what` is "points".
     """
     names = [str(path) for path in paths]
     document = Document(names[0])

@@ -273,7 +273,7 @@ def read_cameras(
     if len(names) > 2:
         raise UsageError(f"there are {len(names)} files; give one, or the two of one rig")
     documents = [Document(name, notes, warnings, distortion, size) for name in names]
-    if len(documents) == 2 and "-" not in names and (merged := _merged(documents)) is not None:
+    if len(documents) == 2 and (merged := _merged(documents)) is not None:
         documents = [merged]
     cameras = [_read(document) for document in documents]
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
