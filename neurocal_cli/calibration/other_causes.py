@@ -27,10 +27,10 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.findings import DETERMINE, LEVEL
+from neurocal_cli.calibration.verdict.findings import DETERMINE, EXPLAINED, LEVEL
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import causes_among
-from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, NEIGHBOURS, ODD_VIEW, SHAPES
+from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, NEIGHBOURS, ODD_POSE, ODD_VIEW, SHAPES
 from neurocal_cli.camera.geometry import Array, median
 
 # Of one view. Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean
@@ -95,8 +95,10 @@ def odd_view(solution: Solution) -> str | None:
     """
     problem, adjusted = solution.problem, solution.adjusted
     views, free = problem.views, problem.free_of_prior
-    if views.n_views <= DETERMINE or problem.type == 3 or not problem.free_poses:
+    if views.n_views <= DETERMINE or problem.type == 3:
         return None
+    if not problem.free_poses:
+        return _with_wrong_pose(contest_of(problem, adjusted, solution.repeated.worth))
     conditions = conditions_on_views(views, adjusted.state)
     spare = views.equations - 6 - conditions
     if spare.min() <= 0:
@@ -124,6 +126,14 @@ def odd_view(solution: Solution) -> str | None:
     rivals = causes_among((ODD_VIEW, ANOTHER_LENS, *SHAPES), problem, adjusted.state, held.n)
     odds = next((one.evidence for one in rivals if one.rival is ODD_VIEW), 0.0) + LEVEL
     return None if any(one.evidence > odds for one in rivals) else views.names[view]
+
+
+def _with_wrong_pose(held: Contest | None) -> str | None:
+    """The view whose given pose is wrong, if that explains most of the error."""
+    first = held.causes[0] if held is not None and held.causes else None
+    if held is None or first is None or first.rival is not ODD_POSE or first.explained < EXPLAINED:
+        return None
+    return held.lin.views.names[int(first.weights.argmax())]
 
 
 def _contradictions(normal: Array, free: NDArray[np.bool_], own: Array) -> Array:

@@ -291,6 +291,8 @@ def _with_fitting_views(
     points: Correspondences, options: Options, kept: _Kept, solution: Solution
 ) -> tuple[_Kept, Solution]:
     """Take back the views that fit the final camera: their networks, or an earlier camera, knew less."""
+    if not solution.problem.free_poses:  # another pose than the given one is none of them
+        return kept, solution
     usual, fitting = rms(solution) ** 2, []
     for name in kept.wrong_views:
         one = points.select(_is_of(points, name))
@@ -328,7 +330,8 @@ def _rejected(points: Correspondences, kept: _Kept, solution: Solution) -> Rejec
     if not contradicts_sigma(solution):
         for name, reason in reasons.items():
             plain = replace(points.select(_is_of(points, name)), covariance=None, across=None)
-            reasons[name] = why_odd(plain, solution.camera, rms(solution), reason)
+            posed = solution.problem.free_poses
+            reasons[name] = why_odd(plain, solution.camera, rms(solution), reason, posed)
     rows = np.flatnonzero(~kept.mask)
     if not rows.size:
         return Rejected(views=reasons)

@@ -35,6 +35,7 @@ from neurocal_cli.calibration.verdict.rivals import (
     ANOTHER_LENS,
     EFFECTS,
     NEIGHBOURS,
+    OF_POSES,
     RICHER_LENSES,
     RIVALS,
     SHAPES,
@@ -80,6 +81,8 @@ class Contest:
         first = self.causes[0] if self.causes else None
         if first is None:
             return 0.0
+        if first.rival.effect in OF_POSES:  # the target would take in what is wrong with given poses
+            return float("inf")
         # A lens whose rays do not meet in one point says nothing against a shape that comes before it.
         beside = (no_pupil,) if first.rival.of_board else ()
         known = [one for one in self.causes if not (one.rival.unknown or one.rival.effect in beside)]
@@ -107,11 +110,12 @@ def contest(
     estimated. `worth` is the effective share of the views if they repeat poses. `shaped` tells whether the
     target's common shape was estimated with the camera.
     """
-    if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
+    if views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
+    known = tuple(effect for effect in EFFECTS if not (free_poses and effect in OF_POSES))
 
     def at_minimum(*more: Effect) -> Linearised:
-        lin = linearised(views, state, free, free_poses, (*EFFECTS, *more), image_size)
+        lin = linearised(views, state, free, free_poses, (*known, *more), image_size)
         return _with_shape(lin) if shaped else lin
 
     try:
@@ -214,20 +218,20 @@ def _others(causes: Iterable[Estimate], rivals: tuple[Rival, ...]) -> tuple[Riva
 def _best(
     at: Linearised, ranking: list[Estimate], share: float, rivals: tuple[Rival, ...]
 ) -> tuple[Estimate, ...]:
-    """The best rival, or the best two that are more probable together."""
+    """The best rival, or two that are more probable together than it is by itself or with another one."""
     best: tuple[Estimate, ...] = (ranking[0],)
     highest = ranking[0].evidence + LEVEL
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
-    for one in [one for one in others if one.weights.size][:_MOST]:
+    for one in [one for one in (*best, *others) if one.weights.size][: _MOST + 1]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others([one], rivals), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
         second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
         if second and one.evidence + second[0].evidence > highest:
             best, highest = (one, second[0]), one.evidence + second[0].evidence
-    return best
+    return best[:1] if best[0] is ranking[0] else best
 
 
 def _fitted(lin: Linearised, one: Estimate) -> Estimate | None:
@@ -246,7 +250,10 @@ def _fitted(lin: Linearised, one: Estimate) -> Estimate | None:
     else:
         return None
     moving = np.isin(np.arange(5 + len(state.k)), free)
-    fits = [adjust(views.subset(some).batches, state.of_views(some), moving, True, NEARBY) for some in groups]
+    fits = [
+        adjust(views.subset(some).batches, state.of_views(some), moving, lin.free_poses, NEARBY)
+        for some in groups
+    ]
     cost, left = sum(float(fit.cost.sum()) for fit in fits), (1.0 - one.explained) * lin.cost
     if not 0 < cost < left:
         return one

@@ -29,22 +29,20 @@ _SQUEEZED = 0.1  # least difference of the focal lengths along u and v, relative
 
 def bends(seen: Seen) -> Array | None:
     """Heights of the board that are powers of the place on it."""
-    if seen.by_board is None or seen.places is None:
+    if not seen.flat:
         return None
-    x, y = seen.places
-    return np.stack([x**i * y**j for i, j in BENDS], axis=1)[:, :, None] * seen.by_board[:, 2:]
+    x, y, _ = seen.at
+    return np.stack([x**i * y**j for i, j in BENDS], axis=1)[:, :, None] * seen.by_target[:, 2:]
 
 
 def stretch(seen: Seen) -> Array | None:
     """A print that is longer along the board, and whose sides lean."""
-    if seen.by_board is None or seen.places is None:
-        return None
-    return seen.by_board[:, :1] * np.stack(list(seen.places), axis=1)[:, :, None]
+    return seen.by_target[:, :1] * np.moveaxis(seen.at[:2], 0, 1)[:, :, None] if seen.flat else None
 
 
 def deformed(seen: Seen) -> Array | None:
     """A target that is not flat, deformed without a change of its scale."""
-    if seen.by_target is None or seen.at is None:
+    if seen.flat:
         return None
     from neurocal_cli.adjustment.open_choices import SOLID_STRETCHES
 
@@ -53,7 +51,7 @@ def deformed(seen: Seen) -> Array | None:
 
 def field(seen: Seen) -> Array:
     """A smooth field of displacements, by powers of the place on the board; of that in the image if none."""
-    x, y = np.moveaxis(seen.pixels, 1, 0) if seen.places is None else seen.places
+    x, y = seen.at[:2] if seen.flat else np.moveaxis(seen.pixels, 1, 0)
     return _by_powers(seen, [x**i * y**j for i, j in ((1, 0), (0, 1), *BENDS)])
 
 
@@ -73,12 +71,12 @@ def _by_powers(seen: Seen, powers: list[Array]) -> Array:
 
 def glass(seen: Seen) -> Array | None:
     """A plate of glass on the board: points move away from the foot of the camera's perpendicular."""
-    if seen.by_board is None or seen.to_camera is None:
+    if not seen.flat:
         return None
     slope = seen.to_camera[:, :2] / np.abs(seen.to_camera[:, 2:])  # tangents of the angles of incidence
     s2 = (slope**2).sum(axis=1, keepdims=True)
     shift = slope * (1 / np.sqrt(_GLASS**2 * (1 + s2) - s2) - 1 / _GLASS)
-    return (seen.by_board[:, :2] * shift[:, :, None]).sum(axis=1, keepdims=True)
+    return (seen.by_target[:, :2] * shift[:, :, None]).sum(axis=1, keepdims=True)
 
 
 def no_pupil(seen: Seen) -> Array:
@@ -103,10 +101,28 @@ def turning(seen: Seen) -> Array:
 
 def moving(seen: Seen) -> Array | None:
     """The target moves past the camera while the rows are read; nearer points move farther."""
-    if seen.to_camera is None:
+    if not seen.flat:
         return None
     nearer = 1 / np.linalg.norm(seen.to_camera, axis=1)
     return seen.by_entries[:, 3:5] * (seen.pixels[:, 1] * nearer / nearer.mean())[:, None, None]
+
+
+def pose(seen: Seen) -> Array:
+    """The pose of the view is another one: its rotation, and its shift over the size of the target."""
+    return seen.by_pose
+
+
+def moved_camera(seen: Seen) -> Array:
+    """The camera is elsewhere by one motion in its own frame, as if a hand-eye calibration were wrong."""
+    by_tau, size = seen.by_pose[:, 3:], seen.size[:, None, None, None]
+    turned = seen.by_pose[:, :3] + np.cross(seen.origin[:, :, None, None], by_tau, axis=1)
+    return np.concatenate([turned, by_tau / size], axis=1)
+
+
+def moved_target(seen: Seen) -> Array:
+    """The target is elsewhere by one motion in its own frame."""
+    turned = np.cross(np.moveaxis(seen.at, 0, 1)[:, :, None], seen.by_target, axis=1)
+    return np.concatenate([turned, seen.by_target], axis=1)
 
 
 def cut(axis: int) -> Effect:

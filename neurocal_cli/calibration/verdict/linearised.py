@@ -8,7 +8,6 @@ tells all that the residuals say about the camera and the effects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +52,11 @@ class Board:
         size = np.abs((world - centre) @ axes).max(axis=0)
         return cls(centre, axes, size[0], size[1] / size[0]) if size[2] <= _FLAT * size[0] else solid
 
+    @property
+    def flat(self) -> bool:
+        """Whether it is flat."""
+        return not np.isnan(self.aspect)
+
     def bend(self, height: Callable[[Array, Array], Array]) -> float:
         """Height between the highest and the lowest point [world unit], of heights over the half length."""
         ends = np.linspace(-1, 1, _ACROSS)
@@ -71,16 +75,16 @@ class Seen:
     by_depth: Array  # (T, 2, n) derivatives by a shift along the axis of the lens [world unit]
     from_centre: Array  # (T, 2, n) the same places as `pixels`, from the image centre
     focal: Array  # (2,) focal lengths along u and v, over S1
-    # Derivatives (T, 3, 2, n) along the board, across it and along its normal, over its half length; the
-    # places x, y (2, T, n) on it, over the same; and the directions (T, 3, n) to the camera along these axes.
-    # They are None without a common flat board.
-    by_board: Array | None = None
-    places: Array | None = None
-    to_camera: Array | None = None
-    # The derivatives along the axes of the world, and the places (3, T, n), over half the size of the target,
-    # if it is not flat.
-    by_target: Array | None = None
-    at: Array | None = None
+    by_pose: Array  # (T, 6, 2, n) derivatives by the poses of the views
+    origin: Array  # (T, 3) the middle of the target from the camera, over its size in this view
+    size: Array  # (T,) this, over that of all views
+    # Derivatives (T, 3, 2, n) along the axes of the target, over its half length: along a board, across it
+    # and along its normal, else along those of the world; the places (3, T, n), over the same; and the
+    # directions (T, 3, n) to the camera along these axes.
+    by_target: Array
+    at: Array
+    to_camera: Array
+    flat: bool  # whether all views show one flat board
 
 
 Effect = Callable[[Seen], Array | None]
@@ -107,6 +111,7 @@ class Linearised:
     given: NDArray[np.intp]  # those of the entries of A that are given
     spare: float  # equations beyond the unknowns
     board: Board
+    free_poses: bool  # whether the poses are estimated
 
     @property
     def alphas_free(self) -> bool:
@@ -173,7 +178,7 @@ def linearised(
     spare = views.n_equations - int(free.sum()) - (6 * views.n_views if free_poses else 0)
     return Linearised(
         views, state, effects, middle, R, N[:, kept[:-1], kept[:-1]], solved, columns,
-        np.flatnonzero(free), np.flatnonzero(~free[:5]), max(spare, 1.0), board,
+        np.flatnonzero(free), np.flatnonzero(~free[:5]), max(spare, 1.0), board, free_poses,
     )  # fmt: skip
 
 
@@ -195,30 +200,18 @@ def _derivatives(
                 off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
             off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
-        by_depth = J[:, POSE][:, 5] / views.scale[view][:, None, None]
+        by_pose, scale, local = J[:, POSE], views.scale[view][:, None, None], batches.local[chunk]
+        back, tau = np.swapaxes(state.R[view], 1, 2), state.t[view]
+        world = local * scale + views.centre[view][:, :, None]
+        at = np.moveaxis(board.axes.T @ (world - board.centre[:, None]) / board.size, 1, 0)
+        by_local = (back @ by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(by_pose[:, 3:].shape)
+        by_target = np.einsum("ia,tipn->tapn", board.axes, by_local * (board.size / scale[..., None]))
+        to_camera = np.einsum("ia,tin->tan", board.axes, -back @ tau[:, :, None] - local)
         from_centre, focal = observed - off - state.entries[0, 3:, None], state.entries[0, [0, 2]]
-        seen = Seen(J[:, :5], observed - off - middle[:, None], px, by_depth, from_centre, focal)
-        seen = _on_target(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
+        seen = Seen(
+            J[:, :5], observed - off - middle[:, None], px, by_pose[:, 5] / scale, from_centre, focal,
+            by_pose, tau, views.scale[view] / views.scale.mean(), by_target, at, to_camera, board.flat,
+        )  # fmt: skip
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}
         widths = {effect: part.shape[1] for effect, part in found.items()}
         yield chunk, np.concatenate([J[:, :-1], *found.values(), J[:, -1:]], axis=1), widths
-
-
-def _on_target(
-    seen: Seen,
-    views: Views,
-    state: CameraState,
-    board: Board,
-    view: NDArray[np.intp],
-    local: Array,
-    by_pose: Array,
-) -> Seen:
-    n, scale, back = local.shape[2], views.scale[view][:, None, None], np.swapaxes(state.R[view], 1, 2)
-    world = local * scale + views.centre[view][:, :, None]
-    at = np.moveaxis(board.axes.T @ (world - board.centre[:, None]) / board.size, 1, 0)
-    by_local = (back @ by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
-    by_board = np.einsum("ia,tipn->tapn", board.axes, by_local * (board.size / scale[..., None]))
-    if np.isnan(board.aspect):
-        return replace(seen, by_target=by_board, at=at)
-    to_camera = np.einsum("ia,tin->tan", board.axes, -back @ state.t[view][:, :, None] - local)
-    return replace(seen, by_board=by_board, places=at[:2], to_camera=to_camera)

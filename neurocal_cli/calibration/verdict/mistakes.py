@@ -192,14 +192,16 @@ def _misfit(plane: Array, pixels: Array) -> float:
     return rms if np.isfinite(rms) else np.inf
 
 
-def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:
+def why_odd(
+    points: Correspondences, camera: Camera, rmse_px: float, otherwise: str, posed: bool = True
+) -> str:
     """Explain why one view, of which these are the points, contradicts the others.
 
-    The camera is calibrated from the other views, and `rmse_px` is their rms error [px]. A reason is "its u
-    and v are exchanged", for example; it is `otherwise` if no hypothesis fits. One has to leave as little
-    error as the other views have, and to beat a bent target by the `LEVEL` of all causes: seen from afar, a
-    turned image or one of another size looks nearly like the same target in another pose, and a bend of the
-    board takes in the rest.
+    The camera is calibrated from the other views, and `rmse_px` is their rms error [px]. `posed` tells
+    whether poses were estimated. A reason is "its u and v are exchanged", for example; it is `otherwise` if
+    no hypothesis fits. One has to leave as little error as the other views have, and to beat a bent target by
+    the `LEVEL` of all causes: seen from afar, a turned image or one of another size looks nearly like the
+    same target in another pose, and a bend of the board takes in the rest.
     """
     if not arrange(points).nearly_flat.all() or len(points) < FEWEST_POINTS:
         return otherwise
@@ -212,6 +214,8 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     if plain is None:
         return next((reason for reason, error, _ in mistakes if error < limit), otherwise)
     own = rms(plain)
+    if not posed and own < limit:
+        return "its given pose is wrong: its points fit another one"
 
     def odds(error: float, unknowns: int = 0) -> float:
         """Errors below the other views' do not count."""

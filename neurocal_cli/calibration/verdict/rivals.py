@@ -15,6 +15,7 @@ from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 
 CHANGED = Limit(0.002, 0.05)
 """Limits of a change of the focal length or the centre, over the focal length; a result has half of it."""
+_POSES = Limit(0.0, DISPLACED.poor)  # nothing takes in what is wrong with given ones
 SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
 """Advice where it is wrong."""
 _TO_CORNERS = "add views with points nearer to the image's corners, by which a richer lens can be selected"
@@ -61,6 +62,38 @@ RIVALS: tuple[Rival, ...] = (
         effects.common,
         steps=effects.given_lens,
         of_given=True,
+    ),
+    Rival(
+        "wrong given poses",
+        "in each view, another pose than the given one takes the residuals away",
+        "check that each pose was read while its image was taken, or let them be estimated, with --type 1",
+        words.wrong_poses,
+        _POSES,
+        effect=effects.pose,
+    ),
+    Rival(
+        "a wrong given pose",
+        "the same in one view alone",
+        "correct this pose, or leave the view out",
+        words.wrong_pose,
+        _POSES,
+        effects.one_view,
+        effect=effects.pose,
+    ),
+    *(
+        Rival(
+            f"given poses with a wrong place of the {what}",
+            f"one motion of the {what} in all views takes the residuals away",
+            f"calibrate {'hand and eye' if what == 'camera' else 'where the target is'} again",
+            words.moved(what, how),
+            _POSES,
+            effects.common,
+            effect=effect,
+        )
+        for what, how, effect in (
+            ("camera", "as with a wrong hand-eye calibration", effects.moved_camera),
+            ("target", "as if it were elsewhere on its table or tool", effects.moved_target),
+        )
     ),
     Rival(
         "a changing focal length",
@@ -267,7 +300,13 @@ ANOTHER_LENS = replace(
 """They are not told if this one is more probable, nor is a view left out."""
 ODD_VIEW = next(rival for rival in RIVALS if rival.patterns is effects.one_view and rival.steps)
 """One view with another camera."""
+ODD_POSE = next(
+    rival for rival in RIVALS if rival.patterns is effects.one_view and rival.effect is effects.pose
+)
+"""One view with another pose than the given one."""
 SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is effects.common)
 """Those by which the target has another shape in all views."""
 EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
 """All effects of the rivals."""
+OF_POSES = (effects.pose, effects.moved_camera, effects.moved_target)
+"""Those that estimated poses take in."""

@@ -91,7 +91,7 @@ def two_cameras(told: Told) -> Said:
         entries = lin.state.entries[0] + step[:5]
         if len(which) >= DETERMINE:
             batches, state = lin.views.subset(which).batches, lin.state.of_views(which)
-            entries = adjust(batches, state, free, True, NEARBY).state.entries[0]
+            entries = adjust(batches, state, free, lin.free_poses, NEARBY).state.entries[0]
         cameras.append(entries[[0, 2, 3, 4]] * px + np.append([0.0, 0.0], lin.views.pixel_centre))
     order = in_sequence(lin.views.names)
     names, others = ([lin.views.names[k] for k in order if member[k] == some] for some in (True, False))
@@ -150,6 +150,41 @@ def odd_view(told: Told) -> Said:
     return (
         f"{told.members[0]}: it fits another camera or crop: its focal length is {moved[0]:+.2g} px and its "
         f"centre ({moved[-2]:+.2g}, {moved[-1]:+.2g}) px from that of the others",
+        told.displaced / told.diagonal,
+    )
+
+
+def wrong_poses(told: Told) -> Said:
+    """Given poses that are wrong in each view."""
+    scale = told.lin.views.scale[:, None]
+    return _off("the given poses are wrong, each in its own way", told, told.found.amounts, scale)
+
+
+def wrong_pose(told: Told) -> Said:
+    """One given pose that is wrong."""
+    scale = told.lin.views.scale[told.found.weights > 0]
+    return _off(f"{told.members[0]}: the given pose is wrong", told, told.found.amounts[None], scale)
+
+
+def moved(what: str, how: str) -> Say:
+    """Given poses that are wrong by one motion."""
+
+    def say(told: Told) -> Said:
+        lin = told.lin
+        scale = np.array([lin.views.scale.mean() if what == "camera" else lin.board.size])
+        all_off = f"all given poses are wrong by one motion of the {what}, {how}"
+        return _off(all_off, told, told.found.amounts[None], scale)
+
+    return say
+
+
+def _off(reason: str, told: Told, amounts: Array, scale: Array) -> Said:
+    """By how much (rms) poses are off whose amounts (V, 6) are rotations, and shifts over a scale."""
+    turn, shift = (
+        float(np.sqrt((one**2).sum(axis=1).mean())) for one in (amounts[:, :3], amounts[:, 3:] * scale)
+    )
+    return (
+        f"{reason}, by {shift:.2g} {told.unit} and {np.degrees(turn):.2g} degrees",
         told.displaced / told.diagonal,
     )
 

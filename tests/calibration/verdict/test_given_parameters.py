@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,11 +15,11 @@ from support.slow_cases import slow_but
 from support.targets import photographed
 from support.wrong_inputs import flat
 
-from neurocal_cli import Correspondences, Intrinsics, calibrate
+from neurocal_cli import Calibration, Correspondences, Intrinsics, calibrate
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.geometry import rotation_step
+from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.monotonic import largest_angle
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
@@ -194,6 +196,66 @@ def test_given_poses_are_not_turned(seed: int) -> None:
     in_camera = np.einsum("nij,nj->ni", R[points.view_index], points.world) + t[points.view_index]
     errors = points.pixels - found.camera.project(in_camera)[0]
     assert found.rmse_px == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def with_given_poses(
+    wrong: Callable[[int, Array, Array], tuple[Array, Array]], **options: object
+) -> Calibration:
+    """A calibration from the true poses, changed by view, rotation and translation."""
+    points, truth = photographed("flat", 5, 12, 0.0)
+    poses = zip(points.view_names, truth.R, truth.t, strict=True)
+    given = {name: Pose(*wrong(k, R, t)) for k, (name, R, t) in enumerate(poses)}
+    return calibrate(points, type=4, extrinsics=given, **options)
+
+
+def turned(rng: np.random.Generator, degrees: float) -> Array:
+    return np.asarray(rotation_step(np.radians(degrees) * rng.normal(size=(1, 3)))[0])
+
+
+def test_given_poses_that_are_all_wrong_are_the_cause_not_lens_or_target() -> None:
+    rng = np.random.default_rng(0)
+    found = with_given_poses(lambda k, R, t: (turned(rng, 0.1) @ R, t + 0.5 * rng.normal(size=3)))
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word == "poor"
+    assert "the given poses are wrong, each in its own way, by 0." in found.verdict.reasons[0]
+
+
+@pytest.mark.parametrize(("side", "words"), [("camera", "hand-eye"), ("target", "elsewhere")])
+def test_one_motion_of_all_given_poses_is_told(side: str, words: str) -> None:
+    rng = np.random.default_rng(1)
+    turn, shift = turned(rng, 0.5), 2.0 * rng.normal(size=3)
+
+    def moved(k: int, R: Array, t: Array) -> tuple[Array, Array]:
+        return (turn @ R, turn @ t + shift) if side == "camera" else (R @ turn, t + R @ shift)
+
+    found = with_given_poses(moved)
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word == "poor"
+    assert f"by one motion of the {side}" in found.verdict.reasons[0]
+    assert words in found.verdict.reasons[0]
+
+
+@pytest.mark.parametrize("outliers", ["reject", "keep"])
+def test_one_given_pose_that_is_wrong_is_named(outliers: Literal["reject", "keep"]) -> None:
+    """It was replaced by an estimated one, with which the reported error was that of noise."""
+    odd = np.array([3.0, 4.0, 0.0])
+    found = with_given_poses(lambda k, R, t: (R, t + odd * (k == 4)), outliers=outliers)
+    if outliers == "reject":
+        assert found.rejected.views == {"v04": "its given pose is wrong: its points fit another one"}
+        assert found.rmse_px < 0.15
+    else:
+        assert found.verdict is not None
+        assert found.verdict.word == "poor"
+        assert "v04: the given pose is wrong, by 5 mm" in found.verdict.reasons[0]
+
+
+def test_right_given_poses_are_not_accused() -> None:
+    found = with_given_poses(lambda k, R, t: (R, t))
+    assert found.verdict is not None
+    assert found.verdict.word == "good"
+    assert not found.rejected.views
 
 
 def test_given_poses_that_are_off_are_not_excused_by_a_board_that_bends() -> None:
