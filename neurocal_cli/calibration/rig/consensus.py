@@ -22,7 +22,6 @@ from neurocal_cli.calibration.calibration import Calibration, ViewResult
 from neurocal_cli.calibration.rig.adjust import rig_problem
 from neurocal_cli.calibration.rig.frames import FrameNames, ViewPairs, frames_of_pairs
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, median, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
@@ -55,7 +54,8 @@ PAIR_ANEW = (
     "one image of one camera is missing or was taken twice; name the views that were taken at the same "
     "moment alike"
 )
-SHIFTED = {word: f"the left image fits the right one of the {word} pair" for word in ("next", "previous")}
+NEXT = {"next": 1, "previous": -1}
+SHIFTED = {word: f"the left image fits the right one of the {word} pair" for word in NEXT}
 NEIGHBOUR = "fits the images of the"  # next or previous frame, of a view in a rig of more than two
 OPPOSITE = {"next": "previous", "previous": "next"}
 
@@ -82,14 +82,17 @@ def find_consensus(problem: RigProblem) -> RigConsensus:
     return RigConsensus(_mean_rig(poses, sound), _reasons(problem, poses, R, t, sound))
 
 
-def with_shifted(problem: RigProblem, rig: Pose, faults: Mapping[Pair, str]) -> dict[Pair, str]:
-    """The faults, with pairs named whose left views fit the right views of the next or the previous pairs.
+def with_shifted(
+    problem: RigProblem, rig: Pose, faults: Mapping[Pair, str], neighbours: Mapping[str, Sequence[Pair]]
+) -> dict[Pair, str]:
+    """The faults, with pairs named whose left views fit the right views of the next or the previous frames.
 
     From the place on where one camera lost an image, or took one twice, all views are paired wrongly.
+    `neighbours` are the left views with these right ones.
     """
     odd = {a: b for (a, b), reason in faults.items() if reason == UNSYNCHRONISED}
     for word in SHIFTED:
-        moved = [pair for pair in neighbours(problem.pairs, word) if pair[0] in odd]
+        moved = [pair for pair in neighbours[word] if pair[0] in odd]
         if len(moved) < LEAST_AGREED:
             continue
         shifted = _of_pairs(problem, moved)
@@ -100,13 +103,15 @@ def with_shifted(problem: RigProblem, rig: Pose, faults: Mapping[Pair, str]) -> 
     return dict(faults)
 
 
-def all_shifted(problem: RigProblem) -> str:
-    """The word for the pairs whose right views the left views fit, if all are paired wrongly; else empty."""
-    if len(problem.paired) < 2 * LEAST_AGREED:
-        return ""
+def all_shifted(problem: RigProblem, neighbours: Mapping[str, Sequence[Pair]]) -> str:
+    """The word for the frames whose right views the left views fit, if all are paired wrongly; else empty.
+
+    `neighbours` are the left views with these right ones.
+    """
     for word in SHIFTED:
-        shifted = _of_pairs(problem, neighbours(problem.pairs, word))
-        reasons = find_consensus(shifted).reasons
+        if len(neighbours[word]) < 2 * LEAST_AGREED:
+            continue
+        reasons = find_consensus(_of_pairs(problem, neighbours[word])).reasons
         if reasons.count("") > AGREED * len(reasons):
             return word
     return ""
@@ -147,13 +152,6 @@ def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> t
             last, first = seen[seen < at].max(initial=0), seen[seen >= at].min(initial=n - 1)
             return gained, int(last), int(first)
     return None
-
-
-def neighbours(pairs: Sequence[Pair], word: str) -> list[Pair]:
-    """Each left view with the right view of the next, or of the previous, pair."""
-    ordered = [pairs[k] for k in in_sequence(tuple(a for a, _ in pairs))]
-    first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
-    return [(a, b) for (a, _), (_, b) in zip(first, second, strict=True)]
 
 
 def _of_pairs(problem: RigProblem, pairs: Sequence[Pair]) -> RigProblem:

@@ -25,6 +25,7 @@ from neurocal_cli.calibration.rig.consensus import (
     EXCHANGED,
     LEAST_AGREED,
     NEIGHBOUR,
+    NEXT,
     OPPOSITE,
     PAIR_ANEW,
     SHIFTED,
@@ -35,9 +36,9 @@ from neurocal_cli.calibration.rig.consensus import (
     find_consensus,
     with_shifted,
 )
-from neurocal_cli.calibration.rig.frames import groups
+from neurocal_cli.calibration.rig.frames import FrameNames, groups
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.verdict.findings import in_sequence, name_some
+from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.pinhole import Pose
@@ -168,6 +169,8 @@ class Edge:
     # The views of pairs that do not agree with the others, and why: only what the uncertainty of the poses
     # does not explain, unless the fault has a name.
     faults: Mapping[tuple[str, str], str]
+    # The left views with the right ones of the next frame, and of the previous one.
+    neighbours: Mapping[str, Sequence[tuple[str, str]]]
 
     @property
     def n_agreed(self) -> int:
@@ -181,9 +184,10 @@ class Edge:
         return self.n_agreed >= min(max(_SLOW * n, LEAST_AGREED), n)
 
 
-def examined(problem: RigProblem, seen: NDArray[np.bool_]) -> list[Edge]:
-    """The edges that are worth a look, those with most frames first; `seen` (C, V) as in `FrameNames`."""
-    return [_edge(problem, pair) for pair in _chosen(seen)]
+def examined(problem: RigProblem, frames: FrameNames) -> list[Edge]:
+    """The edges that are worth a look, those with most frames first."""
+    place = np.argsort(frames.sequence)
+    return [_edge(problem, pair, place) for pair in _chosen(frames.seen)]
 
 
 def _chosen(seen: NDArray[np.bool_]) -> list[Pair]:
@@ -209,11 +213,18 @@ def _tree(weight: NDArray[np.int_]) -> list[Pair]:
     return pairs
 
 
-def _edge(problem: RigProblem, pair: Pair) -> Edge:
+def _edge(problem: RigProblem, pair: Pair, place: NDArray[np.intp]) -> Edge:
     two = problem.of_two(*pair)
     consensus = find_consensus(two)
+    left, right = (
+        dict(zip(place[problem.observations[c].view].tolist(), problem.names[c], strict=True)) for c in pair
+    )
+    neighbours = {
+        word: [(view, right[k + step]) for k, view in left.items() if k + step in right]
+        for word, step in NEXT.items()
+    }
     reasons = dict(zip(two.pairs, consensus.reasons, strict=True))
-    faults = with_shifted(two, consensus.rig, {one: why for one, why in reasons.items() if why})
+    faults = with_shifted(two, consensus.rig, {one: why for one, why in reasons.items() if why}, neighbours)
     poses = relative_poses(two, consensus.rig)
     if poses is not None:
         faults = {one: why for one, why in faults.items() if why != UNSYNCHRONISED}
@@ -221,7 +232,7 @@ def _edge(problem: RigProblem, pair: Pair) -> Edge:
         if used.any():
             odd = zip(two.pairs, odd_pairs(poses, used), strict=True)
             faults |= {one: UNSYNCHRONISED for one, is_odd in odd if is_odd}
-    return Edge(pair, two, consensus, faults)
+    return Edge(pair, two, consensus, faults, neighbours)
 
 
 def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
@@ -247,8 +258,13 @@ def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
     return [found[k] for k in range(1, len(names))]
 
 
-def exchanged_cameras(edges: Sequence[Edge], problem: RigProblem, names: Sequence[str]) -> str:
-    """What is wrong where two cameras have each other's images from some frame on; "" if none have."""
+def exchanged_cameras(
+    edges: Sequence[Edge], problem: RigProblem, names: Sequence[str], sequence: NDArray[np.intp]
+) -> str:
+    """What is wrong where two cameras have each other's images from some frame on; "" if none have.
+
+    `sequence` (V,) is that of the frames.
+    """
     n_odd, n_all = np.zeros((2, len(names)), dtype=int)
     for edge in edges:
         n_all[list(edge.cameras)] += len(edge.consensus.reasons)
@@ -256,14 +272,13 @@ def exchanged_cameras(edges: Sequence[Edge], problem: RigProblem, names: Sequenc
     most = np.argsort(-n_odd / np.maximum(n_all, 1), kind="stable")[:_SUSPECTS]
     suspects = sorted(most[n_odd[most] >= LEAST_AGREED].tolist())
     word = [next(iter(views.values())) for views in problem.views]
-    order = in_sequence(tuple(word))
-    place = np.argsort(order)
+    place = np.argsort(sequence)
     best, told = 0, ""
     for a, b in combinations(suspects, 2):
         found = exchanged(problem, a, b, place)
         others = sum(len(e.consensus.reasons) - e.n_agreed for e in edges if {a, b}.isdisjoint(e.cameras))
         if found is not None and found[0] > max(best, others):
-            best, (last, first) = found[0], (word[order[k]] for k in found[1:])
+            best, (last, first) = found[0], (word[sequence[k]] for k in found[1:])
             told = (
                 f"the images of cameras {names[a]} and {names[b]} were exchanged between {last} and {first}; "
                 "exchange the names of these cameras in one of the two parts"
@@ -279,7 +294,7 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
     for edge in outer:
         a, b = edge.cameras
         alone, other = (names[a], names[b]) if a in part else (names[b], names[a])
-        if word := all_shifted(edge.problem):
+        if word := all_shifted(edge.problem, edge.neighbours):
             return (
                 f"the images of camera {alone} are shifted by one: they fit those of camera {other} of the "
                 f"{word if a in part else OPPOSITE[word]} frame; {PAIR_ANEW}"

@@ -68,8 +68,8 @@ def fit_rig(
     views = connected_frames({name: camera.points for name, camera in cameras.items()})
     cameras = dict(zip(names, with_agreeing_poses(list(cameras.values()), views), strict=True))
     problem = rig_problem(list(cameras.values()), views.of_views)
-    edges = examined(problem, views.seen)
-    if told := exchanged_cameras(edges, problem, names):
+    edges = examined(problem, views)
+    if told := exchanged_cameras(edges, problem, names, views.sequence):
         raise DegenerateGeometryError(told)
     start = connected(edges, names)
     _refuse_poor_camera(edges, names)

@@ -22,7 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.verdict.findings import name_some
+from neurocal_cli.calibration.verdict.findings import in_sequence, name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import planes_are_named
@@ -181,6 +181,11 @@ class FrameNames:
 
     names: tuple[str, ...]  # of the frames, in the order in which the cameras saw them
     of_views: tuple[NDArray[np.intp], ...]  # of each camera, (V_c,) frame of each view
+
+    @property
+    def sequence(self) -> NDArray[np.intp]:
+        """(V,) the frames in the order of their names."""
+        return np.array(in_sequence(self.names), dtype=np.intp)
 
     @property
     def seen(self) -> NDArray[np.bool_]:

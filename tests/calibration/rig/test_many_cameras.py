@@ -307,11 +307,25 @@ def test_a_target_of_another_size_in_one_camera_is_named() -> None:
         )
 
 
-def test_a_camera_whose_images_are_shifted_by_one_is_named() -> None:
-    _, points = scene("line", 4, 30)
-    names = np.array([f"{int(name) + 1:03d}" for name in np.asarray(points["cam3"].view)])
-    with pytest.raises(NeurocalError, match="the images of camera cam3 are shifted by one"):
-        calibrate_rig({**points, "cam3": replace(points["cam3"], view=names)}, skew=False)
+@pytest.mark.parametrize(
+    ("layout", "n", "frames", "by", "word"),
+    slow_but(
+        (("ring", 6, 60, 1, "previous"),),
+        [("ring", 6, 60, 1, "previous"), ("ring", 8, 40, -1, "next"), ("line", 4, 30, 1, "previous"),
+         ("star", 5, 40, -1, "next"), ("facing", 4, 60, 1, "previous")],
+    ),
+)  # fmt: skip
+def test_a_camera_whose_images_are_shifted_by_one_is_named(
+    layout: str, n: int, frames: int, by: int, word: str
+) -> None:
+    _, points = scene(layout, n, frames)
+    names = np.array([f"{int(name) + by:03d}" for name in np.asarray(points["cam3"].view)])
+    told = (
+        rf"the images of camera cam3 are shifted by one: they fit those of camera cam\d of the {word} frame"
+    )
+    shifted = {**points, "cam3": replace(points["cam3"], view=names)}
+    with pytest.raises(NeurocalError, match=told):
+        calibrate_rig(shifted, skew=False, distortion="k1k2", target="given")
 
 
 @pytest.mark.parametrize(
