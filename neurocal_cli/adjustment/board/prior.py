@@ -272,6 +272,11 @@ class Coordinates:
         """(k,) variances for given sizes of the parts."""
         return np.asarray(self.units @ self.prior.as_array(sizes) ** 2)
 
+    def precision(self, sizes: Mapping[str, float]) -> Array:
+        """(3 n, 3 n) inverse of the prior covariance of the offsets."""
+        by_offsets = self.of_rows(np.eye(3 * len(self.prior.axes)))
+        return np.asarray(np.linalg.inv((by_offsets.T * self.variances(sizes)) @ by_offsets))
+
 
 @lru_cache(maxsize=4)  # one calibration asks for them four times
 def coordinates_of(prior: Prior) -> Coordinates:

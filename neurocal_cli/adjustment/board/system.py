@@ -159,11 +159,11 @@ class PosesFirst:
     Everything independent of the sizes is computed once.
     """
 
-    def __init__(self, info: Information, prior: Prior, matrix: Array, of_poses: float = 0.0) -> None:
+    def __init__(self, info: Information, prior: Prior, matrix: Array, of_poses: float) -> None:
         self.info, self.coordinates, self.f = info, coordinates_of(prior), len(info.cameras.shared) - 1
         self.of_poses = of_poses
         M = self._by_coordinates(self._by_coordinates(matrix).T)
-        _hold_untold(M, self.f)
+        hold_untold(M, self.f)
         self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
 
     def _by_coordinates(self, rows: Array) -> Array:
@@ -227,7 +227,7 @@ class PointsFirst:
         M[: self.f, -1], M[self.f : s, -1] = shared[:-1, -1], across[-1]
         M[s:dim, -1], M[-1, -1] = cross[:, :, -1].reshape(-1), info.cost
         M[-1, :dim] = M[:dim, -1]
-        _hold_untold(M, self.f)
+        hold_untold(M, self.f)
         self.bordered = M
         # (n, 3, s + P p + 1): coupling of each point to all other unknowns and to the right side
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
@@ -276,7 +276,7 @@ class PointsFirst:
         )  # fmt: skip
 
 
-def _hold_untold(M: Array, f: int) -> None:
+def hold_untold(M: Array, f: int) -> None:
     """Let those of the f parameters of cameras that no view tells stay as they are.
 
     Of few views, a camera of several may have none.

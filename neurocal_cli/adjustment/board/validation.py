@@ -20,7 +20,7 @@ offsets only together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,8 @@ from neurocal_cli.adjustment.board.information import (
     without_points,
 )
 from neurocal_cli.adjustment.board.posterior import camera_step, camera_step_of, log_evidence, minimum_of
-from neurocal_cli.adjustment.board.prior import Prior
-from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst, WithoutPoses, points_first
+from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
+from neurocal_cli.adjustment.board.system import PointsFirst, WithoutPoses, hold_untold, points_first
 from neurocal_cli.adjustment.cross_validation import least_by_precision
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.camera.geometry import Array
@@ -192,11 +192,15 @@ def without_each(
     `variance` [px^2] is that of the noise. Raises `numpy.linalg.LinAlgError` if the other parts do not
     determine the cameras.
     """
-    systems: Iterator[PosesFirst | PointsFirst]
     if points_first(sum(part.info.cameras.cross[..., -1].size for part in parts), prior):
         rest = ([part.info for part in parts if part is not out] for out in parts)
-        systems = (PointsFirst(joined(some), prior) for some in rest)
-    else:
-        whole = np.asarray(sum(part.matrix for part in parts))
-        systems = (PosesFirst(out.info, prior, whole - out.matrix) for out in parts)
-    return [minimum_of(system, sizes, variance) for system in systems]
+        return [minimum_of(PointsFirst(joined(some), prior), sizes, variance) for some in rest]
+    f, whole = len(parts[0].info.cameras.shared) - 1, np.asarray(sum(part.matrix for part in parts))
+    whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
+    estimated = []
+    for out in parts:
+        M = whole - out.matrix
+        hold_untold(M, f)
+        step = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
+        estimated.append((step[:f], step[f:].reshape(-1, 3)))
+    return estimated
