@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.rectification import Rectification, rectify
+from neurocal_cli.calibration.rig.rectification import Rectification, must_rectify, rectify
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
@@ -80,11 +80,7 @@ def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, st
 
     if rig.unit not in METRES:
         raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
-    rectified = rectify(rig, alpha)
-    if rectified is None:
-        raise InputError(
-            "ROS's files need images of one known size; put image_size into both files of points"
-        )
+    rectified = must_rectify(rig, alpha, "put image_size into both files of points")
     metres = rectified.P2.copy()
     metres[:, 3] *= METRES[rig.unit]
     sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)

@@ -2,7 +2,8 @@
 
 R1, R2, P1, P2 and Q are those of OpenCV's ``stereoRectify`` (Bouguet), with zero disparity at infinity. Each
 camera is turned by half of the rig's rotation. Both are then turned together until the baseline is
-parallel to an axis, the one along its longer component.
+parallel to an axis, the one along its longer component. If the right camera is mounted upside down or on its
+side, its image is first turned by quarters until it is as upright as the left one.
 
 `rectify` finds the matrices, and `rectified_pair` the cameras, for which points and pictures are converted.
 """
@@ -20,7 +21,7 @@ from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix, nearest_rotation
+from neurocal_cli.camera.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.undistortion import plane_like
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError, check_kind
@@ -28,9 +29,10 @@ from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.undistorted_points import map_points, shown
 
 _GRID = 9  # samples along each side of the image, as in OpenCV
-_WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
+_WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image, and from an axis to its plane's
 _ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
 _LINES = 16  # over the images
+_QUARTERS = tuple(euler_to_rotation(0.0, 0.0, np.radians(d)).round() for d in (0, 90, 180, 270))
 _COLOURS = ((255, 80, 60), (60, 200, 255), (120, 255, 120), (255, 220, 60))
 
 
@@ -46,7 +48,7 @@ class Rectification:
 
 
 def rectify(rig: StereoRig, alpha: float | None = None) -> Rectification | None:
-    """Rectify a rig; None where the image sizes are unknown or differ.
+    """Rectify a rig; None if the image sizes are unknown or differ, or the cameras face away from each other.
 
     The rectified images are scaled by alpha. With 0 all their pixels are valid, with 1 they contain all
     pixels of the original images, and values in between interpolate. With None nothing is scaled. The
@@ -55,14 +57,15 @@ def rectify(rig: StereoRig, alpha: float | None = None) -> Rectification | None:
     check_kind("rig", rig, StereoRig, "what calibrate_stereo made, or Rig.pair")
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")
-    size = rig.left.image_size
-    if size is None or size != rig.right.image_size:
+    size = _size(rig)
+    if size is None or np.tan(0.5 * np.arccos(np.clip(rig.R[2, 2], -1.0, 1.0))) > _WIDEST:
         return None
-    half = nearest_rotation(rig.R + np.eye(3))  # its square is R
-    t = half.T @ rig.t
+    quarter = max(_QUARTERS, key=lambda turn: float((turn * rig.R.T).sum()))
+    half = nearest_rotation(quarter @ rig.R + np.eye(3))  # its square is R, so turned
+    t = half.T @ quarter @ rig.t
     axis = 0 if abs(t[0]) > abs(t[1]) else 1
     turn = _shortest_turn(t, np.eye(3)[axis] * (1.0 if t[axis] > 0 else -1.0))
-    rotations = turn @ half, turn @ half.T
+    rotations = turn @ half, turn @ half.T @ quarter
     cameras = [(rig.left.camera, rotations[0]), (rig.right.camera, rotations[1])]
     along = float((rotations[1] @ rig.t)[axis])
     f = 0.5 * float(sum(plane_like(camera).A[1 - axis, 1 - axis] for camera, _ in cameras))
@@ -76,6 +79,23 @@ def rectify(rig: StereoRig, alpha: float | None = None) -> Rectification | None:
     Q = np.zeros((4, 4))
     Q[:2, :2], Q[:2, 3], Q[2, 3], Q[3, 2] = np.eye(2), -centre, f, -1.0 / along
     return Rectification(*rotations, P1, P2, Q)
+
+
+def must_rectify(rig: StereoRig, alpha: float | None, advice: str) -> Rectification:
+    """Rectify a rig, or raise why not; the advice is how to give an image size."""
+    found = rectify(rig, alpha)
+    if found is not None:
+        return found
+    if _size(rig) is None:
+        raise InputError(f"both cameras must have images of one known size to be rectified; {advice}")
+    raise DegenerateGeometryError(
+        "the cameras face away from each other, so no plane shows what both see; triangulate original pixels"
+    )
+
+
+def _size(rig: StereoRig) -> tuple[int, int] | None:
+    """Width and height of both images; None where they are unknown or differ."""
+    return rig.left.image_size if rig.left.image_size == rig.right.image_size else None
 
 
 def _shortest_turn(a: Array, b: Array) -> Array:
@@ -147,12 +167,7 @@ class RectifiedPair:
 
 def rectified_pair(rig: StereoRig, alpha: float | None = None) -> RectifiedPair:
     """Rectify the cameras of a rig, whose images must have one known size; see `rectify`."""
-    matrices = rectify(rig, alpha)
-    if matrices is None:
-        raise InputError(
-            "both cameras must have images of one known size to be rectified; put image_width and "
-            "image_height into the rig's file"
-        )
+    matrices = must_rectify(rig, alpha, "put image_width and image_height into the rig's file")
     if not matrices.P1[0, 0] > 0:
         raise DegenerateGeometryError(
             f"the optical axes of the cameras differ so much that rectified images cannot be scaled by alpha "

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.rectification import rectify
+from neurocal_cli.calibration.rig.rectification import must_rectify
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import format_camera_info, matrix_data
@@ -103,9 +103,7 @@ def joined(left: CameraSet, right: CameraSet) -> CameraSet:
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     if len(cameras.cameras) == 1:
         return {"": format_camera_info(cameras.cameras[0], cameras.rectified)}
-    rectified = rectify(as_stereo(replace(cameras, origin=None)))
-    if rectified is None:
-        raise InputError("ROS's files need images of one known size; give --image-size")
+    rectified = must_rectify(as_stereo(replace(cameras, origin=None)), None, "give --image-size")
     pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
     return {
         f"{side}.yaml": format_camera_info(camera, pair)

@@ -113,6 +113,29 @@ def test_ros_files_are_in_metres(rig: StereoRig) -> None:
         format_ros_pair(replace(rig, left=replace(rig.left, points=points)))
 
 
+@pytest.mark.parametrize("degrees", [90.0, 180.0, 270.0, 175.0])
+def test_the_image_of_a_camera_upside_down_or_on_its_side_is_turned_up(
+    degrees: float, rig: StereoRig
+) -> None:
+    turn = Pose.from_euler(0.0, 0.0, np.radians(degrees), np.zeros(3)).R
+    found = rectify(replace(rig, pose=Pose.exact(turn @ rig.R, turn @ rig.t)))
+    upright = rectify(rig)
+    assert found is not None
+    assert upright is not None
+    few = np.radians(5.0) if degrees == 175 else 1e-12
+    assert pytest.approx(upright.R1, abs=few) == found.R1
+    assert pytest.approx(upright.R2 @ turn.T, abs=few) == found.R2
+    assert found.P2[0, 3] < 0
+
+
+def test_cameras_back_to_back_are_not_rectified(rig: StereoRig) -> None:
+    for angles in ((0.0, np.pi, 0.0), (np.radians(165.0), 0.0, 0.0)):
+        opposite = replace(rig, pose=Pose.from_euler(angles[0], angles[1], angles[2], rig.t))
+        assert rectify(opposite) is None
+        with pytest.raises(DegenerateGeometryError, match="face away from each other"):
+            rectified_pair(opposite)
+
+
 @cache
 def wide_rig(seed: int) -> StereoRig:
     points = sides(random_rig(np.random.default_rng(seed), "wide", 4), 0.1)
