@@ -1,7 +1,7 @@
 """Evaluation of two cameras by the errors of triangulated points of known position (paper, section 5.2).
 
 The true positions are those of the target, transformed to the left camera's frame by the pose of the view.
-All errors are in that frame, with z along the optical axis.
+All errors are in that frame, with z along the optical axis. As everywhere, each camera counts by its noise.
 
 Errors of points in space: over all points, by view and by depth, and NSCE.
 
@@ -402,6 +402,7 @@ class _Evaluator:
             self.points[1].pixels[pairs.right],
             which=pairs.view,
             method=self.method,
+            noise=None if self.rig is None else self.rig.noise_shares,
         )
         true = in_cameras(poses, self.points[0].world[pairs.left], pairs.view)
         names = [a for a, _ in self.views]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -42,14 +42,6 @@ class FixedCameras(Presented):
     def sigma(self) -> float:
         """Standard deviation of the pixels of the calibration, in u and in v [px]."""
         return self.rmse_px / float(np.sqrt(2.0))
-
-    @property
-    def noise_shares(self) -> Array:
-        """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known."""
-        own = np.array([camera.sigma for camera in any_rig(cast("Rig", self)).cameras.values()])
-        if not (self.sigma > 0 and np.isfinite(own).all()):
-            return np.ones(len(own))
-        return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
 
     @cached_property
     def verdict(self) -> Verdict | None:
@@ -132,6 +124,11 @@ class StereoRig(FixedCameras):
             left_out={},
             judgement=self.verdict,
         )
+
+    @property
+    def noise_shares(self) -> Array:
+        """(2,) standard deviation of each camera's pixels over that of both; 1 where it is not known."""
+        return of_two(self).noise_shares
 
     @property
     def R(self) -> Array:
@@ -236,6 +233,14 @@ class Rig(FixedCameras):
             left_out={},
             judgement=self.verdict,
         )
+
+    @property
+    def noise_shares(self) -> Array:
+        """(C,) standard deviation of each camera's pixels over that of all; 1 where it is not known."""
+        own = np.array([camera.sigma for camera in self.cameras.values()])
+        if not (self.sigma > 0 and np.isfinite(own).all()):
+            return np.ones(len(own))
+        return np.asarray(np.maximum(own / self.sigma, _LEAST_NOISE))
 
     @property
     def first(self) -> str:

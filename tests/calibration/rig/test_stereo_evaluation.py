@@ -10,9 +10,9 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
-from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
-from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
-from neurocal_cli.calibration.rig.triangulation import METHODS
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo, fit_stereo
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.triangulation import METHODS, triangulate
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
@@ -44,6 +44,17 @@ def middle_of_rays(P: tuple[Array, Array], left: Array, right: Array) -> Array:
         off = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         A, b = A + off, b + off @ centre
     return np.asarray(np.linalg.solve(A, b))
+
+
+def test_points_are_those_that_the_rig_triangulates() -> None:
+    scene, rng = flat(), np.random.default_rng(2)
+    points = scene.points(0, 0.05, rng), scene.points(1, 0.5, rng)
+    rig = calibrate_stereo(*points, skew=False, distortion="none", target="given")
+    found, expected = evaluate_stereo_rig(rig).rig, triangulate(rig, *(side.pixels for side in points))
+    assert found is not None
+    assert found.epipolar_px == pytest.approx(np.sqrt((expected.epipolar**2).mean()), rel=1e-9)
+    alike = triangulate(rig.left, rig.right, rig.pose, *(side.pixels for side in points))
+    assert found.rmse_y < 0.8 * np.sqrt(((alike.points - expected.points + found.errors)[:, 1] ** 2).mean())
 
 
 def test_the_errors_are_those_of_the_contract_written_out() -> None:
