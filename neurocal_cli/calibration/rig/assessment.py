@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.cross_validation import quietly
-from neurocal_cli.adjustment.normal_equations import NOTHING, ROUNDING, solve_scaled
+from neurocal_cli.adjustment.cross_validation import Quadratics, quietly
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
@@ -122,8 +122,7 @@ def _held_out(fit: RigFit) -> float:
     several = np.flatnonzero(problem.together)
     fold = np.full(len(problem.scale), -1)
     fold[several] = folds_of(len(several), _FOLDS)
-    whole, _ = fit.normal.only(free).reduced()
-    lost, cost = 0.0, 0.0
+    parts = []
     for k in range(int(fold.max()) + 1):
         left = several[fold[several] != k]
         if not all(np.isin(left, observed.view).any() for observed in problem.observations):
@@ -135,12 +134,12 @@ def _held_out(fit: RigFit) -> float:
         ]
         arrow = problem.gathered(some)
         arrow = replace(arrow, own=arrow.own + np.eye(6) * ~(fold == k)[:, None, None])
-        part, _ = arrow.only(free).reduced()
-        rest = whole - part
-        step = solve_scaled(rest[:-1, :-1], rest[:-1, -1:], ROUNDING)[:, 0]
-        lost += float(part[-1, -1] - 2 * part[-1, :-1] @ step + step @ part[:-1, :-1] @ step)
-        cost += float(part[-1, -1])
-    return float(np.sqrt(lost / cost)) if cost > 0 and np.isfinite(lost) else np.nan
+        parts.append(arrow.only(free).reduced()[0])
+    if not parts:
+        return np.nan
+    folds, rest = Quadratics.of(np.stack(parts)), fit.normal.only(free).reduced()[0] - np.sum(parts, axis=0)
+    lost = folds.held_out(np.arange(len(parts)), (rest[:-1, :-1], rest[:-1, -1])).sum()
+    return float(np.sqrt(lost / folds.cost.sum()))
 
 
 def _typical(of_points: Array) -> float:
