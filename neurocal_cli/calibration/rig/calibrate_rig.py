@@ -41,16 +41,28 @@ _HIDDEN = 0.9
 _OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
-def check_options(options: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse options that `calibrate` does not have, and cameras whose poses are all known."""
-    unknown = set().union(*options.values()) - set(signature(calibrate).parameters)
-    if unknown:
+def _options_of_each(
+    points: Mapping[str, Correspondences],
+    extra: Mapping[str, CameraOptions],
+    options: CameraOptions,
+) -> dict[str, dict[str, Any]]:
+    """The options of each camera, by its name, after all arguments of `calibrate_rig` are checked."""
+    check_kind("points", points, Mapping, "a dict of the points of each camera by its name")
+    if len(points) < 2:
+        raise UsageError(f"a rig has two cameras or more, not {len(points)}; give the points of each camera")
+    for name, one in points.items():
+        check_kind(f"points of {name}", one, Correspondences, "what read_points made")
+    if stray := sorted(set(extra) - set(points)):
+        raise UsageError(f"there are options for a camera {stray[0]!r}, but no points; give its points")
+    of_each: dict[str, dict[str, Any]] = {name: {**options, **extra.get(name, {})} for name in points}
+    if unknown := set().union(*of_each.values()) - set(signature(calibrate).parameters):
         raise UsageError(f"calibrate has no option {min(unknown)!r}; correct its name or leave it out")
-    if any(own.get("type", 1) == 4 for own in options.values()):
+    if any(own.get("type", 1) == 4 for own in of_each.values()):
         raise UsageError(
             "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "
             "camera"
         )
+    return of_each
 
 
 def with_poses(points: Mapping[str, Correspondences]) -> tuple[dict[str, Correspondences], list[str]]:
@@ -194,37 +206,9 @@ def calibrate_rig(
     InputError, DegenerateGeometryError
         No view connects some cameras with the others, or the points do not determine the rig.
     """
-    check_kind("points", points, Mapping, "a dict of the points of each camera by its name")
-    if len(points) < 2:
-        raise UsageError(f"a rig has two cameras or more, not {len(points)}; give the points of each camera")
-    for name, one in points.items():
-        check_kind(f"points of {name}", one, Correspondences, "what read_points made")
-    extra = camera_options or {}
-    if stray := sorted(set(extra) - set(points)):
-        raise UsageError(f"there are options for a camera {stray[0]!r}, but no points; give its points")
-    of_each: dict[str, dict[str, Any]] = {name: {**options, **extra.get(name, {})} for name in points}
-    check_options(of_each)
+    of_each = _options_of_each(points, camera_options or {}, options)
     points, told = with_poses(points)
-    several = [name for name, one in points.items() if one.image is not None]
-    if several and len(several) < len(points):
-        without = next(name for name in points if name not in several)
-        raise InputError(
-            f"camera {without} has no column board, but {several[0]} has; give it to all cameras"
-        )
-    if several:
-
-        def fitted(
-            some: Mapping[str, Correspondences], target: TargetChoice | Target
-        ) -> tuple[dict[str, Calibration], bool]:
-            with_target = {name: {**own, "target": target} for name, own in of_each.items()}
-            return cameras_on_one_target(some, with_target, progress)
-
-        choice = next(iter(of_each.values())).get("target", "auto")
-        (cameras, kept), about_boards = arranged(points, choice, fitted, lambda fit: fit[0])
-        told += about_boards
-    else:
-        connected_frames(points)  # errors are reported before the training
-        cameras, kept = cameras_on_one_target(points, of_each, progress)
+    cameras, kept, about_boards = _cameras(points, of_each, progress)
     rig = fit_rig(
         cameras,
         refine_cameras=all(camera.method in _OF_LEAST_SQUARES for camera in cameras.values()),
@@ -232,7 +216,31 @@ def calibrate_rig(
         target_kept=kept,
     )
     own = told_once({name: camera.warnings for name, camera in rig.cameras.items()})
-    return replace(rig, warnings=(*told, *rig.warnings, *dict.fromkeys(own.values())))
+    return replace(rig, warnings=(*told, *about_boards, *rig.warnings, *dict.fromkeys(own.values())))
+
+
+def _cameras(
+    points: Mapping[str, Correspondences], of_each: Mapping[str, Mapping[str, Any]], progress: Progress | None
+) -> tuple[dict[str, Calibration], bool, tuple[str, ...]]:
+    """As `cameras_on_one_target`, also of several boards; the third result is what these are to each other."""
+    several = [name for name, one in points.items() if one.image is not None]
+    if not several:
+        connected_frames(points)  # errors are reported before the training
+        return *cameras_on_one_target(points, of_each, progress), ()
+    if without := [name for name in points if name not in several]:
+        raise InputError(
+            f"camera {without[0]} has no column board, but {several[0]} has; give it to all cameras"
+        )
+
+    def fitted(
+        some: Mapping[str, Correspondences], target: TargetChoice | Target
+    ) -> tuple[dict[str, Calibration], bool]:
+        with_target = {name: {**own, "target": target} for name, own in of_each.items()}
+        return cameras_on_one_target(some, with_target, progress)
+
+    choice = next(iter(of_each.values())).get("target", "auto")
+    found, about_boards = arranged(points, choice, fitted, lambda fit: fit[0])
+    return *found, about_boards
 
 
 def calibrate_stereo(
