@@ -222,7 +222,7 @@ def calibrate_rig(
 def _cameras(
     points: Mapping[str, Correspondences], of_each: Mapping[str, Mapping[str, Any]], progress: Progress | None
 ) -> tuple[dict[str, Calibration], bool, tuple[str, ...]]:
-    """As `cameras_on_one_target`, also of several boards; the third result is what these are to each other."""
+    """As `cameras_on_one_target`, also of several boards; the third result tells how these are arranged."""
     several = [name for name, one in points.items() if one.image is not None]
     if not several:
         connected_frames(points)  # errors are reported before the training
