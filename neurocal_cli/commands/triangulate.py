@@ -15,6 +15,7 @@ from neurocal_cli.errors import InputError, UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from neurocal_cli.calibration.rig.rig import Rig, StereoRig
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.table_header import Schema
 
 _USUAL_SIGMA = 0.5  # px; default for a rig without points
+_MOST_NOISE = 2.0  # px; more is a mistake and not noise
 _LARGEST_SIGMA = 1e6  # px; no image is that large
 _SAMPLE = 1000  # points whose fault is looked for
 _MANY_OFF = 0.5  # share of the points that chance does not explain
@@ -140,7 +142,7 @@ def triangulate(
 
     sigma = _sigma_of(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
-    tally = _Tally(rig, limit)
+    tally = _Tally(rig, sigma, limit)
     matches = _begun(inputs[-1], MATCHES)
     end_waiting()
     write_chunks(
@@ -253,6 +255,8 @@ def _triangulate_many(
         )
     counts = {"n_points": len(found.points), "n_off": off, "n_behind": behind, "n_without": without}
     summarise(as_json, {**counts, "error_limit_px": limit}, ", ".join(parts))
+    several = found.n_cameras > 1
+    _warned_of_noise(sigma, found.error[several], 2 * found.n_cameras[several] - 3)
 
 
 def _rig(names: tuple[str, ...]) -> StereoRig:
@@ -276,13 +280,28 @@ def _rig(names: tuple[str, ...]) -> StereoRig:
     return rig
 
 
+def _warned_of_noise(sigma: float, errors: Array, dof: NDArray[np.intp] | int = 1) -> bool:
+    """Warn of covariances that are too small, because the pixels are less accurate than those of the rig."""
+    from neurocal_cli.calibration.rig.triangulation import noise_beyond
+
+    noise = noise_beyond(sigma, errors, dof)
+    if noise is None or noise > _MOST_NOISE:
+        return False
+    warn(
+        f"the pixels of a point disagree as those of noise {noise:.2g} px do, but the covariances are for "
+        f"{sigma:.2g} px; give --sigma {noise:.2g} if the pixels are no more accurate"
+    )
+    return True
+
+
 class _Tally:
     """Triangulates batch by batch and counts what is wrong with the points."""
 
-    def __init__(self, rig: StereoRig, limit: float) -> None:
-        self.rig, self.limit = rig, limit
+    def __init__(self, rig: StereoRig, sigma: float, limit: float) -> None:
+        self.rig, self.sigma, self.limit = rig, sigma, limit
         self.points = self.behind = self.off = self.outside = 0
         self.first: Array | None = None  # the first batch, a sample for the cause of what is wrong
+        self.errors: Array | None = None  # its epipolar errors
 
     def triangulated(self, batches: Iterable[Batch]) -> Iterator[tuple[Triangulated, Any]]:
         """The points of each batch of matches, and their names."""
@@ -290,9 +309,10 @@ class _Tally:
 
         rig = self.rig
         for pixels, labels in batches:
-            self.first = pixels if self.first is None else self.first
             left, right = pixels[:, :2], pixels[:, 2:]
             found = solve(rig, left, right)
+            if self.first is None:
+                self.first, self.errors = pixels, found.epipolar
             self.points += len(pixels)
             self.behind += int(found.behind.sum())
             self.off += int((found.off(self.limit) & ~found.behind).sum())
@@ -320,12 +340,22 @@ class _Tally:
                 "or, if they are of resized images, make their rig: neurocal resize RIG.yaml --to W H "
                 "-o RESIZED.yaml"
             )
-        if self.off + self.behind > _MANY_OFF * self.points:
+        many, fault = self.off + self.behind > _MANY_OFF * self.points, ""
+        assert self.first is not None
+        assert self.errors is not None
+        if many:
             from neurocal_cli.calibration.rig.match_mistakes import fault_of_matches
+            from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
 
-            assert self.first is not None
             left, right = self.first[:_SAMPLE, :2], self.first[:_SAMPLE, 2:]
-            fault = fault_of_matches(self.rig, left, right, self.limit) or (
+            # Matches may be less accurate than the rig's own points.
+            limits = (self.limit, max(self.limit, usual_limit(_USUAL_SIGMA)))
+            faults = (fault_of_matches(self.rig, left, right, limit) for limit in limits)
+            fault = next(filter(None, faults), "")
+        if not fault and _warned_of_noise(self.sigma, self.errors):
+            return
+        if many:
+            fault = fault or (
                 "check that uL,vL are pixels of the left camera, that the pixels are neither undistorted nor "
                 "rectified, and the order of the matches"
             )

@@ -151,6 +151,20 @@ def test_mostly_wrong_matches_are_warned_of(folder: Path, tmp_path: Path) -> Non
     assert "most points are flagged off or behind; check that uL,vL are pixels" in result.stderr
 
 
+def test_pixels_that_are_less_accurate_than_the_rigs_own_are_told(folder: Path, tmp_path: Path) -> None:
+    rows = pixels(folder) + np.random.default_rng(5).normal(0, 1.0, pixels(folder).shape)
+    write_matches(tmp_path / "m.csv", rows)
+    words = "the pixels of a point disagree as those of noise 1.1 px do, but the covariances are for 0.19 px"
+    result = run("triangulate", folder / "rig.yaml", tmp_path / "m.csv")
+    assert words + "; give --sigma 1.1 if the pixels are no more accurate" in result.stderr
+    assert "check that uL,vL" not in result.stderr
+    write_matches(tmp_path / "exchanged.csv", rows[:, [2, 3, 0, 1]])
+    result = run("triangulate", folder / "rig.yaml", tmp_path / "exchanged.csv")
+    assert "the left and the right pixels are exchanged" in result.stderr
+    for own in ((folder / "matches.csv",), (tmp_path / "m.csv", "--sigma", 1)):
+        assert "disagree" not in run("triangulate", folder / "rig.yaml", *own).stderr
+
+
 def one_line_error(result: Result, *parts: str) -> None:
     assert result.exit_code == 1
     assert result.stdout == ""

@@ -9,6 +9,7 @@ shortest segment between both rays. Both use undistorted pixels (Hartley and Stu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, get_args, overload
 
@@ -31,6 +32,7 @@ METHODS = get_args(Method)
 
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
 _FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
+_FEWEST_ERRORS, _NOTICED, _CERTAIN = 10, 1.5, 5.0  # points; times the noise; standard deviations
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 
 
@@ -224,3 +226,16 @@ def _sees_sideways(camera: Camera, pixels: Array) -> bool:
 def epipolar_limit(sigma: float) -> float:
     """Epipolar error [px] of outliers, for pixels of a standard deviation [px]."""
     return _EPIPOLAR_SIGMAS * sigma
+
+
+def noise_beyond(sigma: float, error: Array, dof: NDArray[np.intp] | int = 1) -> float | None:
+    """Standard deviation [px] of pixels that their errors in space show, if it is certainly above `sigma`.
+
+    `error` (N,) is per degree of freedom, of which there are `dof`. Up to half of the points may be wrong.
+    """
+    error = error[np.isfinite(error)]
+    if len(error) < _FEWEST_ERRORS:
+        return None
+    # The median of chi-squared by Wilson and Hilferty; that of N values is uncertain by 1.17 / sqrt(N).
+    noise = float(np.median(error / (1 - 2 / (9 * np.asarray(dof))) ** 1.5))
+    return noise if noise > sigma * max(_NOTICED, 1 + _CERTAIN * 1.17 / math.sqrt(len(error))) else None
