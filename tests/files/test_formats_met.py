@@ -1161,6 +1161,16 @@ def test_matrices_that_python_saved_for_matlab_begin_at_zero_with_a_warning(
     assert "its first pixel is taken as 0" in warnings[0]
 
 
+def test_a_struct_of_matlab_may_have_any_name_if_it_is_the_only_one(tmp_path: Path) -> None:
+    struct = {"K": np.add(K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]]), "RadialDistortion": D5[:2]}
+    struct["TangentialDistortion"] = D5[2:4]
+    savemat(tmp_path / "one.mat", {"myCamera": struct, "meanError": 0.2})
+    check(read_cameras([tmp_path / "one.mat"]).cameras[0], E, D4)
+    savemat(tmp_path / "two.mat", {"left": struct, "right": struct})
+    with pytest.raises(FormatError, match="holds no camera that can be read"):
+        read_cameras([tmp_path / "two.mat"])
+
+
 def test_the_parameters_of_dannce_are_matlab_s(tmp_path: Path) -> None:
     shifted = np.add(K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     savemat(tmp_path / "a.mat", {"K": shifted.T, "RDistort": D5[:2], "TDistort": D5[2:4], "r": R, "t": SHIFT})

@@ -38,15 +38,19 @@ _ROUNDED = 1e-3  # share of the focal length by which two statements of it diffe
 
 def _struct(document: Document) -> Field:
     """The struct of a camera or of two, or the variables of the file."""
-    names = STRUCTS if document.data.startswith(MARK) else STRUCTS[:1]
-    found = (document.root[name] for name in names if name in document.root)
-    return next((struct for struct in found if isinstance(struct.value, dict)), document.root)
+    names = list(document.tree) if document.data.startswith(MARK) else STRUCTS[:1]
+    found = [name for name in names if _is_struct(document.tree.get(name))]
+    known = [name for name in STRUCTS if name in found] or (found if len(found) == 1 else [])
+    return document.root[known[0]] if known else document.root
+
+
+def _is_struct(value: object) -> bool:
+    return isinstance(value, dict) and any(keys <= set(value) for keys in (*_CAMERAS, set(_OF_TWO)))
 
 
 def _matches(document: Document) -> object:
     """Whether this is a struct of MATLAB, also in JSON, or a ``.mat`` file without another camera."""
-    tree = _struct(document).value if document.tree else {}
-    if any(keys <= set(tree) for keys in (*_CAMERAS, set(_OF_TWO))):
+    if document.tree and _is_struct(_struct(document).value):
         return True
     return document.data.startswith(MARK) and not LooseKeys(document.root).has_camera()
 
