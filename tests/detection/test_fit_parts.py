@@ -232,6 +232,19 @@ def test_levels_are_fitted_through_hidden_squares() -> None:
     assert shading.spread.max() < 0.05
 
 
+def test_levels_in_even_light_are_known_as_if_this_were_known() -> None:
+    """Few levels do not tell six coefficients, and polynomials through their noise would move the edges."""
+    rng = np.random.default_rng(9)
+    frame = Frame(np.zeros(2), np.ones(2), np.array([320.0, 240.0]), 400.0)
+    errors = []
+    for _ in range(50):
+        place, noise = rng.uniform([100, 100], [540, 380], (24, 2)), np.full(24, 0.25)
+        dark, light = (Levels(place, level + rng.normal(0, 0.5, 24), noise) for level in (30.0, 220.0))
+        errors.append(fit_shading(frame, dark, light).at(place)[0] - 125)
+    # The mean of 24 levels has 0.07, and six coefficients 0.18.
+    assert np.sqrt(np.square(errors).mean()) < 0.12
+
+
 def test_rows_may_be_put_together() -> None:
     rows = Observations.of_points(GRID, GRID, 1.0, 1)
     both = rows.joined_with(replace(rows, value=rows.value + 1))

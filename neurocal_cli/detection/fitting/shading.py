@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ LEVEL_VARIANCE = 0.5 * np.pi / len(_INTERIOR)  # of a square's median, over that
 # Insensitive.
 _STEPS = 2  # reweighted fits after the highest degree has been reached
 _TUKEY = 5.0  # standard deviations beyond which a level is an outlier
+_CHANCE = 2.0  # variances of a level for each term, up to which a degree explains nothing
 _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN, to avoid division by 0
@@ -186,7 +188,11 @@ def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
 
 
 def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
-    """Coefficients of a robust polynomial, and the variance of single levels around it [DN^2]."""
+    """Coefficients of a robust polynomial, and the variance of single levels around it [DN^2].
+
+    Each degree counts as far as it explains more than chance does. Else, the terms that even light does not
+    need would make the levels of a board of few edges uncertain.
+    """
     n = len(levels.level)
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
@@ -198,7 +204,16 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     for used in (*_TERMS, *(most,) * _STEPS):
         used = min(used, most)
         coefficients[:used], residual, spread = _refit(terms[:, :used], levels, residual, spread)
-    return coefficients, spread + most / n * upper_median(levels.variance)
+    chance, count, before = _scatter(residual, most), 0.0, np.zeros(_TERMS[-1])
+    coefficients[:] = 0
+    for fewer, used in pairwise((0, *(m for m in _TERMS if m <= most))):
+        found = np.pad(_refit(terms[:, :used], levels, residual, spread)[0], (0, _TERMS[-1] - used))
+        explained = ((terms @ (found - before)) ** 2).sum()
+        share = max(1 - _CHANCE * (used - fewer) * chance / max(explained, _TINY), 0.0) if fewer else 1.0
+        coefficients += share * (found - before)
+        count += share * (used - fewer)
+        before = found
+    return coefficients, spread + count / n * upper_median(levels.variance)
 
 
 def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:

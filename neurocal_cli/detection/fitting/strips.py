@@ -196,8 +196,10 @@ def _column(x: Array) -> Single:
     return np.asarray(x[:, None], dtype=np.float32)
 
 
-ANCHOR = 2.0  # px; standard deviation of the found vertices as anchors, which keep later maps regular
-_ENOUGH = 60  # edges above which such anchors are not needed
+ANCHOR = 2.0  # px; standard deviation that keeps an edge that is not good from having an effect
+# px; standard deviation of the found vertices, without which a few edges would not determine the lens of a
+# small part of a board, and number of edges above which later maps do not need them
+FOUND, _ENOUGH = 0.15, 60
 
 
 @frozen_dataclass(eq=False)
@@ -238,7 +240,7 @@ class GridImage:
         edges = self.edges.observations(lines, offset, variance, shift)
         if len(offset) > _ENOUGH:
             return edges
-        return edges.joined_with(self.anchors(ANCHOR, shift.shape[1]))
+        return edges.joined_with(self.anchors(ANCHOR if self.grid.paired else FOUND, shift.shape[1]))
 
 
 @frozen_dataclass(eq=False)

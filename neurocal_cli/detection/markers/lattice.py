@@ -34,7 +34,9 @@ _AGREE, _AGREE_PX = 0.03, 0.6  # squares and px; rms error of two markers in one
 _AROUND = 2.3  # squares; markers that predict a vertex
 _REACH = 1.6  # squares between a vertex and the nearest marker or vertex that predicts it
 _MOVED, _MOVED_PX = 0.12, 1.2  # squares and px; greatest distance between prediction and saddle point
-_BESIDE = 0.25  # of a cell; where the four colours around a vertex are looked at
+# Of a cell, and px: where the four colours around a vertex are looked at. Far from it, they may be those of a
+# vertex some pixels away.
+_BESIDE, _BESIDE_PX = 0.25, 5.0
 _UNLIKE = 1.4  # greatest difference of opposite colours over the contrast; 2 at the corner of a lone tag
 _LEAST_CONTRAST = 0.3  # relative to that of most vertices
 _FEWEST = 4  # vertices
@@ -295,11 +297,12 @@ def _refined(
     tags = isinstance(plane, TagPlane) or plane.markers is None
     room = 1.0 if tags else 2 * (1 - plane.markers.side / plane.square)  # type: ignore[union-attr]
     offsets = (_BESIDE * min(room, 1.0) * quadrant * least[:, None]) @ cell
-    levels = interpolate(image, np.nan_to_num(new)[:, None] + offsets)
-    parity = (grid.sum(axis=1) + dark) % 2 == 0
-    sign = np.where(parity, -1.0, 1.0)
-    size = 0.5 * sign * (levels[:, 0] + levels[:, 2] - levels[:, 1] - levels[:, 3])
+    nearer = np.minimum(_BESIDE_PX / np.hypot(*np.moveaxis(offsets, 2, 0)), 1.0)[..., None] * offsets
+    levels = interpolate(image, np.nan_to_num(new)[:, None, None] + np.stack([offsets, nearer], axis=1))
+    sign = np.where((grid.sum(axis=1) + dark) % 2 == 0, -1.0, 1.0)
+    first, second, third, last = np.moveaxis(levels, 2, 0)
+    size = 0.5 * (sign[:, None] * (first + third - second - last)).min(axis=1)
     # Opposite quadrants are alike; at a tag's corner without a square beyond it, they are dark and light.
-    unlike = np.maximum(np.abs(levels[:, 0] - levels[:, 2]), np.abs(levels[:, 1] - levels[:, 3]))
+    unlike = np.maximum(np.abs(first - third), np.abs(second - last)).max(axis=1)
     new[~(unlike < _UNLIKE * np.abs(size))] = np.nan
     return new, np.where(np.isfinite(new[:, 0]), size, np.nan)

@@ -45,7 +45,8 @@ _LONGEST = 2200  # px; larger images are halved first, which still shows the mar
 SMALL, _ENLARGED = 1000, 3.0  # px; smaller images are enlarged by a factor if markers cannot be read
 _WINDOWS = (5, 29, 8)  # px; least and greatest window of the adaptive threshold, and its step
 _SMALLEST = 6.0  # px, least side of a marker
-_APART = 0.02  # of its perimeter; of two nearer quadrangles, one is left out
+# Of its perimeter; of two nearer quadrangles, one is left out, and the distance of two outlines of its border
+_APART, _RING = 0.02, 0.08
 
 
 @frozen_dataclass(eq=False)
@@ -96,8 +97,27 @@ def read_markers(
     marks: Marks | None = None
     for look in looks_at(grey):
         number, corners, rejected = _detected(detector, look)
-        marks = Marks(number + first, corners, dictionary).with_others(marks)
+        seen = _outlined(grey, Marks(number + first, corners, dictionary), rejected, border)
+        marks = seen.with_others(marks)
         yield marks, np.concatenate([corners, rejected])
+
+
+def _outlined(grey: NDArray[np.uint8], marks: Marks, others: Array, border: int) -> Marks:
+    """The markers with the widest quadrangles around them, of others (N, 4, 2), in which they are read, too.
+
+    Narrow windows of the threshold see a blurred border as a ring, which has an outline inside as well.
+    """
+    if not len(marks):
+        return marks
+    corners, read = marks.corners.copy(), numbers_in(grey, others, marks.dictionary, border)
+    for k, own in enumerate(marks.corners):
+        for other in others[read == marks.number[k]]:
+            turned = np.stack([np.roll(other, turn, axis=0) for turn in range(4)])
+            away = np.linalg.norm(turned - own, axis=2).max(axis=1)
+            sides = [np.linalg.norm(np.diff(one, axis=0), axis=1).sum() for one in (corners[k], other)]
+            if away.min() < _RING * sides[0] and sides[0] < sides[1]:
+                corners[k] = turned[away.argmin()]
+    return replace(marks, corners=corners)
 
 
 def candidates(look: Sequence[View]) -> Array:
@@ -246,7 +266,9 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
                     yield Marks(number, np.stack(placed)[first], dictionary), border
 
 
-def numbers_in(light: Image, corners: Array, dictionary: str, border: int) -> NDArray[np.int64]:
+def numbers_in(
+    light: NDArray[np.uint8] | Image, corners: Array, dictionary: str, border: int
+) -> NDArray[np.int64]:
     """Numbers (N,) of the markers of a dictionary within quadrangles (N, 4, 2), clockwise; -1 for none."""
     H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     cells, good = _cells(light, H, DICTIONARIES[dictionary], border)
