@@ -32,7 +32,8 @@ _LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's m
 _LARGEST = 1e9  # px; no image is larger
 # Noise puts pixels at most this share of their distance from the centre beyond the lens's domain.
 _RIM, _HALVINGS = 0.02, 30
-_PLACES = {"alpha_u": 0, "alpha_v": 2, "u0": 3, "v0": 4}  # among A's entries, if theta is a right angle
+_PARAMETERS = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # in the order of A's entries, each given with one
+_SINGLE = ("alpha_u", "alpha_v", "u0", "v0")  # those that can be fixed one by one
 _HOLDING = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")  # models whose coefficients can be fixed
 
 
@@ -214,59 +215,57 @@ def problem_for(
     view, or the given distortion maps no ray to a pixel. Raises DegenerateGeometryError if all pixels
     coincide.
     """
+    _check_given(
+        points, type, {"image_center": image_center, "intrinsics": intrinsics, "extrinsics": extrinsics}
+    )
+    distortion = distortion or Distortion()
+    given: dict[str, float] = {} if skew else {"theta": 0.0}  # A's entries by their parameters
+    if type == 2:
+        given |= zip(("u0", "v0"), _centre(points, image_center).tolist(), strict=True)
+    elif type == 3:
+        given = _entries_of(intrinsics)
+    poses = _poses(points, extrinsics) if type == 4 else None
+    if square:
+        fix = _both_alphas(fix or {}, type, skew)
+    check_kind("fix", fix or {}, Mapping, "a dict such as {'u0': 319.5}")
+    held: dict[str, float] = {}
+    for name, number in (fix or {}).items():
+        _check_fixed(name, number, given, type, skew, distortion.model)
+        (given if name in _PARAMETERS else held)[name] = float(number)
+    known = coefficient_names(distortion.model) if type == 3 else held
+    entries = np.array([given.get(name, 0.0) for name in _PARAMETERS])
+    free_distortion = type != 3 and distortion.model != "none"
+    views, turned = _views_of(points, distortion, entries, free_distortion)
+    free = np.array([name not in given for name in _PARAMETERS])
+    fixed, tied = frozenset((*given, *known)), square and "alpha_u" not in given
+    return Problem(
+        points, views, type, entries, free, poses, fixed, intrinsics, distortion, free_distortion,
+        held=held, square=tied, turned=turned,
+    )  # fmt: skip
+
+
+def _check_given(points: Correspondences, type: int, given: Mapping[str, object]) -> None:
+    """Refuse a type that does not exist, no points, and what a type does not use; `given` are for 2, 3, 4."""
     if not isinstance(type, (int, np.integer)) or type not in (1, 2, 3, 4):
         raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")
     if not len(points):
         raise InputError(f"{points.source}: there are no points to calibrate from; give some")
-    for name, value, wanted in (
-        ("image_center", image_center, 2),
-        ("intrinsics", intrinsics, 3),
-        ("extrinsics", extrinsics, 4),
-    ):
+    for wanted, (name, value) in enumerate(given.items(), start=2):
         if value is not None and type != wanted:
             raise UsageError(f"{name} needs type {wanted}, but the type is {type}; give type={wanted}")
-    entries, free = np.zeros(5), np.ones(5, dtype=bool)
-    fixed: set[str] = set()
-    poses: dict[str, Pose] | None = None
-    if not skew:
-        free[1] = False
-        fixed.add("theta")
-    if type == 2:
-        entries[3:] = _centre(points, image_center)
-        free[3:] = False
-        fixed |= {"u0", "v0"}
-    elif type == 3:
-        if intrinsics is None:
-            raise UsageError("type 3 needs the intrinsics of the camera; give intrinsics=")
-        entries = intrinsics.A[ENTRIES]
-        if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
-            raise InputError(
-                "the given intrinsics are out of range: alpha and the centre must be of the size of an "
-                "image; correct them"
-            )
-        free[:] = False
-        fixed = set(INTRINSIC_NAMES)
-    elif type == 4:
-        poses = _poses(points, extrinsics)
-    distortion = distortion or Distortion()
-    if square:
-        fix = _both_alphas(fix or {}, type, skew)
-    held: dict[str, float] = {}
-    check_kind("fix", fix or {}, Mapping, "a dict such as {'u0': 319.5}")
-    for name, number in (fix or {}).items():
-        _check_fixed(name, number, fixed, type, skew, distortion.model)
-        fixed.add(name)
-        if name in _PLACES:
-            entries[_PLACES[name]], free[_PLACES[name]] = number, False
-        else:
-            held[name] = float(number)
-    free_distortion = type != 3 and distortion.model != "none"
-    if type == 3:
-        fixed |= set(coefficient_names(distortion.model))
-    views, turned = _views_of(points, distortion, entries, free_distortion)
-    given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
-    tied = square and "alpha_u" not in fixed
-    return Problem(points, views, *given, held=held, square=tied, turned=turned)
+
+
+def _entries_of(intrinsics: Intrinsics | None) -> dict[str, float]:
+    """A's entries of type 3."""
+    if intrinsics is None:
+        raise UsageError("type 3 needs the intrinsics of the camera; give intrinsics=")
+    entries = intrinsics.A[ENTRIES]
+    if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
+        raise InputError(
+            "the given intrinsics are out of range: alpha and the centre must be of the size of an "
+            "image; correct them"
+        )
+    return dict(zip(_PARAMETERS, entries.tolist(), strict=True))
 
 
 def _both_alphas(fix: Mapping[str, float], type: int, skew: bool) -> Mapping[str, float]:
@@ -296,8 +295,8 @@ def _check_fixed(name: str, value: float, fixed: Collection[str], type: int, ske
             f"{name} cannot be fixed with the distortion model {model}, which scales it by other parameters; "
             "name fisheye or a model for ordinary lenses"
         )
-    if name not in _PLACES and not (model in _HOLDING and name in coefficient_names(model)):
-        names = ", ".join((*_PLACES, *(coefficient_names(model) if model in _HOLDING else ())))
+    if name not in _SINGLE and not (model in _HOLDING and name in coefficient_names(model)):
+        names = ", ".join((*_SINGLE, *(coefficient_names(model) if model in _HOLDING else ())))
         raise UsageError(
             f"{name} cannot be fixed with the distortion model {model}, but {names} can; for coefficients "
             f"name one of the models {', '.join(_HOLDING)}"

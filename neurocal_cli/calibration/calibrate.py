@@ -5,7 +5,7 @@ The package's docstring lists the steps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, TypedDict, get_args
 
@@ -65,6 +65,13 @@ TRAINERS = get_args(Trainer)
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = get_args(Outliers)
 SKEWS = get_args(Skew)
+_CHOICES = {
+    "method": METHODS,
+    "trainer": TRAINERS,
+    "distortion": DISTORTIONS,
+    "outliers": OUTLIERS,
+    "target": TARGETS,
+}
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
@@ -182,11 +189,12 @@ def calibrate(
 
         several, told = arranged({camera_name: points}, target, fitted, lambda found: {camera_name: found})
         return replace(several, warnings=(*told, *several.warnings))
-    known_target = target if isinstance(target, Target) else None
-    if known_target is not None and known_target.bends is not None:
-        known_target = replace(known_target, bends=None)
+    known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
-    _check_options(method, trainer, distortion, outliers, choice, starts, seed, preferred)
+    _check_options(
+        starts, seed, preferred,
+        method=method, trainer=trainer, distortion=distortion, outliers=outliers, target=choice,
+    )  # fmt: skip
     needing = {
         "fix": fix, "start": start, "square_pixels": square_pixels, "skew auto": skew == "auto",
         f"target {choice}": choice in ("flat", "free"),
@@ -194,21 +202,16 @@ def calibrate(
     }  # fmt: skip
     if method != "neuro" and (named := next((name for name, given in needing.items() if given), None)):
         raise UsageError(f"{named} needs the method neuro, but the method is {method}; leave it out")
-    angle = _angle_of(skew, square_pixels, distortion)
-    if fix and "alpha_v" in fix and angle != "fixed":
-        raise UsageError(
-            "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
-        )
     if backprop is not None and trainer != "backprop":
         raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
+    angle = _angle_of(skew, square_pixels, distortion, fix)
     if known_target is not None:
         points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)
     known = None if given is None else given.intrinsics
     if isinstance(extrinsics, Calibration):
-        poses: Mapping[str, Pose] | None = {name: view.pose for name, view in extrinsics.views.items()}
-    else:
-        poses = extrinsics
+        extrinsics = {name: view.pose for name, view in extrinsics.views.items()}
+    poses = extrinsics
     model, way = _lens_of(type, method, distortion, given)
     options = options_for(
         trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
@@ -218,24 +221,20 @@ def calibrate(
         return problem_for(points, type, image_center, known, poses, with_skew, model, fix, square_pixels)
 
     try:
-        problem = stated(angle == "free")
         if method != "neuro":
             from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
 
-            found = calibrate_by(method, problem, camera_name)
-            _refuse_misfit(found)
-            warnings = _unused(points, f"the method is {method}")
+            found = calibrate_by(method, stated(angle == "free"), camera_name)
+            unused = _unused(points, f"the method is {method}")
         else:
-            solution, rejected = _solved(problem, options, outliers, choice, start)
-            if angle == "auto" and problem.free_camera.any() and shows_skew(solution):
-                solution, rejected = _solved(stated(True), options, outliers, choice)
+            solution, rejected = _solved(stated, angle, options, outliers, choice, start)
             if known_target is not None:
                 solution = solution.noted(target=known_target)
             found = calibration_of(
                 solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
             )
-            _refuse_misfit(found)
-            warnings = _about_target(found, choice)
+            unused = _about_target(found, choice)
+        _refuse_misfit(found)
     except DegenerateGeometryError as error:
         explained = _explained(error, points, type)
         if explained == str(error):
@@ -244,8 +243,8 @@ def calibrate(
     if isinstance(intrinsics, Calibration):
         found = with_given_covariance(found, intrinsics)
     if isinstance(intrinsics, (Camera, Calibration)) and (why := undistorted_before(points, intrinsics)):
-        warnings = (*warnings, why)
-    return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
+        unused = (*unused, why)
+    return replace(found, warnings=(*found.warnings, *unused), judgement=assess)
 
 
 def _explained(error: DegenerateGeometryError, points: Correspondences, type: int) -> str:
@@ -272,12 +271,17 @@ def _true_cause(points: Correspondences, type: int) -> str:
     return "; ".join(mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None) or ())
 
 
-def _angle_of(skew: bool | str, square_pixels: bool, distortion: str) -> str:
+def _angle_of(skew: bool | str, square_pixels: bool, distortion: str, fix: Mapping[str, float] | None) -> str:
     """Whether the angle of the axes is "free", "fixed", or found to be one of them ("auto")."""
     if skew not in (True, False, *SKEWS):
         raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
     if not square_pixels:
-        return "auto" if skew == "auto" else "free" if skew in (True, "free") else "fixed"
+        angle = "auto" if skew == "auto" else "free" if skew in (True, "free") else "fixed"
+        if fix and "alpha_v" in fix and angle != "fixed":
+            raise UsageError(
+                "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
+            )
+        return angle
     if distortion == "plumb-line":
         raise UsageError("square_pixels does not go with the distortion plumb-line; name k1k2p1p2 instead")
     if skew in ("free", "auto"):
@@ -286,9 +290,15 @@ def _angle_of(skew: bool | str, square_pixels: bool, distortion: str) -> str:
 
 
 def _solved(
-    problem: Problem, options: Options, outliers: str, choice: str, start: Calibration | None = None
+    stated: Callable[[bool], Problem],
+    angle: str,
+    options: Options,
+    outliers: str,
+    choice: str,
+    start: Calibration | None = None,
 ) -> tuple[Solution, Rejected]:
     """Fit with the neural method and the chosen options. Imports are local: only what is needed is loaded."""
+    problem = stated(angle == "free")
     known = None if start is None else _known(problem, options, start)
     if outliers == "reject":
         from neurocal_cli.calibration.outlier_rejection import fit_robustly
@@ -310,6 +320,8 @@ def _solved(
         from neurocal_cli.calibration.lens_choice.xi_profile import with_all_minima
 
         solution = with_all_minima(solution)
+    if angle == "auto" and problem.free_camera.any() and shows_skew(solution):
+        return _solved(stated, "free", options, outliers, choice)
     return solution, rejected
 
 
@@ -391,21 +403,9 @@ def _refuse_misfit(calibration: Calibration) -> None:
     )
 
 
-def _check_options(
-    method: str,
-    trainer: str,
-    distortion: str,
-    outliers: str,
-    target: str,
-    starts: int,
-    seed: int,
-    preferred: str,
-) -> None:
-    check_choice("method", method, METHODS)
-    check_choice("trainer", trainer, TRAINERS)
-    check_choice("distortion", distortion, DISTORTIONS)
-    check_choice("outliers", outliers, OUTLIERS)
-    check_choice("target", target, TARGETS)
+def _check_options(starts: int, seed: int, preferred: str, **chosen: str) -> None:
+    for name, value in chosen.items():
+        check_choice(name, value, _CHOICES[name])
     if not isinstance(starts, (int, np.integer)) or starts < 2:
         raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     check_seed(seed)

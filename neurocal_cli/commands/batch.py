@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import ProgressBar, complain, note, print_summary, say, suggest, warn
 from neurocal_cli.errors import NeurocalError, UsageError
@@ -24,6 +25,44 @@ _CSV, _HTML = "summary.csv", "summary.html"
 _MOST_TOLD = 10  # problems of jobs
 _STOPPED = 20  # jobs that the machine made fail, after which the batch ends
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
+
+
+@frozen_dataclass
+class _Workers:
+    """The values of the options of what does the jobs."""
+
+    workers: int | None
+    jobs: int | None
+    scheduler: str | None
+    ship: bool
+
+    def check(self) -> None:
+        """Refuse options that contradict each other, with a UsageError, and workers of Dask without it."""
+        from neurocal_cli.commands import cluster
+
+        ways = {"--workers": self.workers, "--jobs": self.jobs, "--scheduler": self.scheduler}
+        chosen = [name for name, value in ways.items() if value]
+        if len(chosen) > 1:
+            raise UsageError(f"{chosen[0]} and {chosen[1]} contradict each other; give one of them")
+        if self.ship and self.scheduler is None:
+            raise UsageError("--ship is for the workers of a --scheduler; leave it out")
+        if not cluster.is_installed() and (self.workers or self.scheduler):
+            raise NeurocalError(f"{chosen[0]} needs Dask; pip install 'dask[distributed]', or use --jobs")
+
+    def run(self, stack: ExitStack, folder: str) -> Run:
+        """What does tasks: processes of this machine, or the workers of a cluster."""
+        from neurocal_cli.commands import cluster
+        from neurocal_cli.files.processes import usable_cores, work_off
+
+        if self.scheduler is not None:
+            client = stack.enter_context(cluster.running_cluster(self.scheduler))
+            if not self.ship:
+                _check_shared(client, folder)
+        elif self.jobs is not None or not cluster.is_installed():
+            return lambda work, tasks: work_off(work, tasks, self.jobs or usable_cores())
+        else:
+            client = stack.enter_context(cluster.local_cluster(self.workers or usable_cores()))
+        return lambda work, tasks: cluster.work_off_by(client, work, tasks, ahead=1 if self.ship else 4)
 
 
 @click.command(cls=options.Command)
@@ -46,18 +85,29 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
     "Compare each camera with that of the same name in an earlier summary, and mark those that have changed, "
     "as neurocal drift does, and cameras of rigs that have moved.",
 )
-@options.count(
-    "--workers",
-    "N",
-    "Number of Dask workers to start on this machine; needs the extra fleet.",
-    without="the number of cores",
-)
-@options.count("--jobs", "N", "Number of processes on this machine, without Dask.", without="Dask workers")
-@options.path(
-    "--scheduler", "ADDRESS", "Use the workers of this running Dask scheduler, such as tcp://host:8786."
-)
-@options.flag(
-    "--ship", "With --scheduler: send the inputs to workers that do not see the files, and fetch the results."
+@options.collected(
+    _Workers,
+    [
+        options.count(
+            "--workers",
+            "N",
+            "Number of Dask workers to start on this machine; needs the extra fleet.",
+            without="the number of cores",
+        ),
+        options.count(
+            "--jobs", "N", "Number of processes on this machine, without Dask.", without="Dask workers"
+        ),
+        options.path(
+            "--scheduler",
+            "ADDRESS",
+            "Use the workers of this running Dask scheduler, such as tcp://host:8786.",
+        ),
+        options.flag(
+            "--ship",
+            "With --scheduler: send the inputs to workers that do not see the files, and fetch the results.",
+        ),
+    ],
+    "workers",
 )
 @options.flag("--force", "Do all jobs again, also those that are done.")
 @options.json
@@ -66,10 +116,7 @@ def batch(
     manifest: str,
     common: options.Named,
     against: str | None,
-    workers: int | None,
-    jobs: int | None,
-    scheduler: str | None,
-    ship: bool,
+    workers: _Workers,
     force: bool,
     as_json: bool,
     output: str,
@@ -109,17 +156,8 @@ def batch(
       # neurocal batch sample_data/fleet.csv --scheduler tcp://host:8786 \\
       #     --ship -o third
     """  # noqa: D301 - as in the group
-    ways = {"--workers": workers, "--jobs": jobs, "--scheduler": scheduler}
-    chosen = [name for name, value in ways.items() if value]
-    if len(chosen) > 1:
-        raise UsageError(f"{chosen[0]} and {chosen[1]} contradict each other; give one of them")
-    if ship and scheduler is None:
-        raise UsageError("--ship is for the workers of a --scheduler; leave it out")
+    workers.check()
     preparation.check_folder("-o", output)
-    from neurocal_cli.commands import cluster
-
-    if not cluster.is_installed() and (workers or scheduler):
-        raise NeurocalError(f"{chosen[0]} needs Dask; pip install 'dask[distributed]', or use --jobs")
     from neurocal_cli.commands.batch_jobs import job_of
     from neurocal_cli.files.batch_files import locked, read_data_sets, read_fleet
 
@@ -134,26 +172,8 @@ def batch(
     os.makedirs(folder, exist_ok=True)
     with ExitStack() as stack:
         stack.enter_context(locked(folder))
-        run = cache(lambda: _runner(stack, folder, workers, jobs, scheduler, ship))
-        _Batch(folder, output, todo, run, ship, force).carry_out(former, as_json)
-
-
-def _runner(
-    stack: ExitStack, folder: str, workers: int | None, jobs: int | None, scheduler: str | None, ship: bool
-) -> Run:
-    """What does tasks: processes of this machine, or the workers of a cluster."""
-    from neurocal_cli.commands import cluster
-    from neurocal_cli.files.processes import usable_cores, work_off
-
-    if scheduler is not None:
-        client = stack.enter_context(cluster.running_cluster(scheduler))
-        if not ship:
-            _check_shared(client, folder)
-    elif jobs is not None or not cluster.is_installed():
-        return lambda work, tasks: work_off(work, tasks, jobs or usable_cores())
-    else:
-        client = stack.enter_context(cluster.local_cluster(workers or usable_cores()))
-    return lambda work, tasks: cluster.work_off_by(client, work, tasks, ahead=1 if ship else 4)
+        run = cache(lambda: workers.run(stack, folder))
+        _Batch(folder, output, todo, run, workers.ship, force).carry_out(former, as_json)
 
 
 def _check_shared(client: Any, folder: str) -> None:

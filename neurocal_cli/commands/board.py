@@ -170,7 +170,7 @@ def target(camera: str, file: str | None, plots: Plots, as_json: bool, output: s
     if described is None and calibration.points.board:
         described = parse_board(calibration.points.board, f"{camera}: observations.board")
     board = board_of(*known) if described is None else with_found_points(described, *known)
-    if not preparation.is_for_the_eye(output, "board.yaml"):
+    if not preparation.is_for_the_eye(output):
         write_board(board, output)
     suggest(output, "neurocal detect IMAGE... --board {} -o points.csv")
     found = calibration.target, calibration.unit

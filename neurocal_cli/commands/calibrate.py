@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.preparation import Plots, plot_option, plot_result
-from neurocal_cli.commands.report import html_option, write_page
+from neurocal_cli.commands.outcome import Outputs, outputs
 from neurocal_cli.commands.show import CAMERA_PANELS
-from neurocal_cli.commands.streams import ProgressBar, concluding, suggest, warn
+from neurocal_cli.commands.streams import ProgressBar, suggest
 
 _STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 
@@ -19,21 +20,18 @@ _STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 @estimation_options()
 @boards.board_of_corners
 @options.camera_name
-@plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
-@html_option
-@options.lean
-@options.summary
-@options.output("CAMERA.yaml", "Write the calibration to this file.")
+@outputs(
+    "CAMERA.yaml",
+    "Write the calibration to this file.",
+    "the residuals, the coverage, the uncertainty, the poses and the learning curve",
+    CAMERA_PANELS,
+)
 def calibrate(
     points: tuple[str, ...],
     estimation: Estimation,
     board: str | None,
     camera_name: str,
-    plots: Plots,
-    html: str | None,
-    lean: bool,
-    as_json: bool,
-    output: str,
+    outputs: Outputs,
 ) -> None:
     """Calibrate a camera from known points and their pixels.
 
@@ -84,7 +82,7 @@ def calibrate(
     """  # noqa: D301 - as in the group
     estimation.check()
     inputs = *points, estimation.intrinsics, estimation.extrinsics
-    preparation.check((*inputs, board), (output, html), plots=plots, as_json=as_json)
+    outputs.check((*inputs, board))
     given, arguments = estimation.prepare(preparation.given_points(*points, board=board))
 
     from neurocal_cli.calibration.calibrate import calibrate as learn
@@ -93,15 +91,12 @@ def calibrate(
 
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
-    with concluding(calibration, as_json, calibration_json, calibration_report):
-        if not preparation.is_for_the_eye(output, "camera.yaml"):
-            warn(*write_result(calibration, output, lean=lean))
-        plot_result(plots, calibration)
-        write_page(html, calibration, *inputs)
+    write = partial(write_result, lean=outputs.lean)
+    with outputs.concluding(calibration, calibration_json, calibration_report, write, inputs):
         verdict, distorted = calibration.verdict, not calibration.camera.distortion.is_identity
-        if html is None:
-            suggest(output, "neurocal report {} -o report.html")
-        if verdict is not None and verdict.word != "good" and not lean:
-            suggest(output, "neurocal advise {}")
+        if outputs.html is None:
+            suggest(outputs.output, "neurocal report {} -o report.html")
+        if verdict is not None and verdict.word != "good" and not outputs.lean:
+            suggest(outputs.output, "neurocal advise {}")
         else:
-            suggest(output, "neurocal " + (_STRAIGHTEN if distorted else "evaluate {} --at DISTANCE"))
+            suggest(outputs.output, "neurocal " + (_STRAIGHTEN if distorted else "evaluate {} --at DISTANCE"))

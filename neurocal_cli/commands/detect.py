@@ -198,7 +198,7 @@ def detect(
         for name, outcome in outcomes.items():
             if outcome.overlay is not None:
                 write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
-    if not preparation.is_for_the_eye(output, "points.csv"):
+    if not preparation.is_for_the_eye(output):
         write_whole(output, text)
     suggest(output, "neurocal calibrate {} -o camera.yaml")
 

@@ -7,17 +7,9 @@ from typing import Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.preparation import Plots, plot_option, plot_result, write_plots
-from neurocal_cli.commands.streams import (
-    ProgressBar,
-    concluding,
-    noted,
-    print_summary,
-    print_text,
-    say,
-    suggest,
-    warn,
-)
+from neurocal_cli.commands.outcome import Outputs, outputs
+from neurocal_cli.commands.preparation import Plots, plot_option, write_plots
+from neurocal_cli.commands.streams import ProgressBar, noted, print_summary, print_text, say, suggest, warn
 from neurocal_cli.errors import UsageError
 
 _MOST_UNITS = 20  # of a layer
@@ -101,16 +93,17 @@ def lens() -> None:
     default="auto",
 )
 @options.seed
-@plot_option("each parameter over the settings, with its uncertainty, and the errors")
-@options.summary
-@options.output("LENS.yaml", "Write the lens to this file.")
+@outputs(
+    "LENS.yaml",
+    "Write the lens to this file.",
+    "each parameter over the settings, with its uncertainty, and the errors",
+    page=False,
+)
 def fit(
     points: tuple[str, ...],
     hidden: tuple[int, int] | None,
     no_skew: bool,
-    plots: Plots,
-    as_json: bool,
-    output: str,
+    outputs: Outputs,
     **same: Any,  # arguments of `fit_lens` with the same names and values
 ) -> None:
     """Learn how the camera depends on zoom and focus.
@@ -139,7 +132,7 @@ def fit(
       neurocal lens fit sample_data/zoom.csv --hidden 2 2 --outliers keep --seed 1 \\
           --target given --json -o lens.yaml
     """  # noqa: D301 - as in the group
-    preparation.check(points, (output,), plots=plots, as_json=as_json)
+    outputs.check(points)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
     from neurocal_cli.files.lens_files import read_lens_data, write_lens
@@ -152,12 +145,9 @@ def fit(
             learnt = fit_lens_cameras(data, same["seed"], topologies=topologies, progress=progress)
         else:
             learnt = fit_lens(data, skew=not no_skew, topologies=topologies, progress=progress, **same)
-    with concluding(learnt, as_json, lens_json, lens_report):
-        if not preparation.is_for_the_eye(output, "lens.yaml"):
-            write_lens(learnt, output)
-        plot_result(plots, learnt)
+    with outputs.concluding(learnt, lens_json, lens_report, write_lens):
         settings = " ".join(f"--{name} {name[0].upper()}" for name in learnt.controls)
-        suggest(output, f"neurocal lens camera {{}} {settings} -o camera.yaml")
+        suggest(outputs.output, f"neurocal lens camera {{}} {settings} -o camera.yaml")
 
 
 @lens.command(cls=options.Command)

@@ -367,16 +367,18 @@ def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], 
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
 
 
+def usual_output() -> str:
+    """A name for the output of the current command, such as ``camera.yaml``; "" if it has none."""
+    params = click.get_current_context().command.params
+    return next((str(option.metavar).lower() for option in params if option.name == "output"), "")
+
+
 def check_ending() -> None:
     """Refuse an output whose name promises something else than it would hold, with a UsageError."""
-    context = click.get_current_context()
-    name = str(context.params.get("output"))
-    for option in context.command.params:
-        ending = os.path.splitext(str(option.metavar))[1]
-        promises = name.lower().endswith(_NO_TEXTS) and not name.lower().endswith(ending)
-        if option.name == "output" and ending in _TEXTS and promises:
-            instead = str(option.metavar).lower()
-            raise UsageError(f"-o {name} would hold {_TEXTS[ending]}; give a name such as {instead}")
+    name, instead = str(click.get_current_context().params.get("output")), usual_output()
+    ending = os.path.splitext(instead)[1]
+    if ending in _TEXTS and name.lower().endswith(_NO_TEXTS) and not name.lower().endswith(ending):
+        raise UsageError(f"-o {name} would hold {_TEXTS[ending]}; give a name such as {instead}")
 
 
 def _storable(ctx: click.Context, param: click.Parameter, name: str) -> str:

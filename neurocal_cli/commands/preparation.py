@@ -20,7 +20,6 @@ from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back, wr
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
@@ -58,11 +57,11 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
     options.check_ending()
 
 
-def is_for_the_eye(output: str, name: str, what: str = "the file") -> bool:
+def is_for_the_eye(output: str, what: str = "the file") -> bool:
     """Whether a result that nobody asked for would go to a terminal, over its summary; say how to keep it."""
     if output != "-" or options.typed("output") or not is_terminal(sys.stdout):
         return False
-    say(f"{what} is not kept; add `-o {name}` to keep it, or `-o -` to see it")
+    say(f"{what} is not kept; add `-o {options.usual_output()}` to keep it, or `-o -` to see it")
     return True
 
 
@@ -204,14 +203,6 @@ def plot_option(what: str, panels: Sequence[str] = ()) -> Callable[[F], F]:
         show_default="none",
         help=f"Plot {what} to this .png, .pdf or .svg file{each if panels else ''}.",
     )
-
-
-def plot_result(plots: Plots, result: Calibration | StereoRig | Rig | ZoomLens) -> None:
-    """Draw and write all pictures of a result; its modules are loaded only if there are any."""
-    if plots:
-        from neurocal_cli.commands.show.results import plot
-
-        write_plots(plots, plot, result)
 
 
 def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:

@@ -1,4 +1,4 @@
-"""``neurocal report`` and the option ``--html``: a result as one HTML page."""
+"""``neurocal report``: a result as one HTML page."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import TYPED, note, suggest
+from neurocal_cli.commands.streams import note, suggest
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
     from neurocal_cli.files.tree_fields import Field
 
 _MOST_BYTES = 1_400_000  # of all photographs; encoded as text they take a third more
@@ -69,37 +68,10 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     data, source = read_bytes(result)
     root = parse_tree(decode(data, source, "a calibration"), source)
     text = _page(root, {source: hashlib.sha256(data).hexdigest()}, images)
-    if preparation.is_for_the_eye(output, "report.html", "the page"):
+    if preparation.is_for_the_eye(output, "the page"):
         return
     write_whole(output, text)
     suggest(output, "open {} in a browser")
-
-
-html_option = options.path(
-    "--html",
-    "REPORT.html",
-    "Also write the page that `neurocal report` makes, with this command and the SHA-256 of its inputs.",
-)
-
-
-def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs: str | None) -> None:
-    """Write the page about a result from these input files; does nothing without a name."""
-    if html is None:
-        return
-    import hashlib
-    import shlex
-
-    from neurocal_cli.commands.show.html_page import Origin, versions
-    from neurocal_cli.commands.show.html_reports import page_of
-
-    files = {}
-    for name in inputs:
-        if name is not None:
-            data, source = read_bytes(name)
-            files[source] = hashlib.sha256(data).hexdigest()
-    typed = click.get_current_context().meta.get(TYPED, ())
-    origin = Origin(files, shlex.join(("neurocal", *typed)), versions())
-    write_whole(html, page_of(result, origin))
 
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:

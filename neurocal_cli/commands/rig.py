@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.preparation import Plots, plot_option, plot_result
-from neurocal_cli.commands.report import html_option, write_page
+from neurocal_cli.commands.outcome import Outputs, outputs
 from neurocal_cli.commands.show import RIG_PANELS
-from neurocal_cli.commands.streams import ProgressBar, concluding, note, noted, suggest, warn
+from neurocal_cli.commands.streams import ProgressBar, note, noted, suggest
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.writing import write_whole
 
@@ -62,22 +62,18 @@ class _Command(options.Command):
 )
 @boards.board_of_corners
 @estimation_options(files=False)
-@plot_option("the cameras and the boards in space, and what pairs of cameras see together,")
-@html_option
-@options.lean
-@options.summary
-@options.output("RIG.yaml", "Write the rig to this file.")
+@outputs(
+    "RIG.yaml",
+    "Write the rig to this file.",
+    "the cameras and the boards in space, and what pairs of cameras see together,",
+)
 def rig(
     files: tuple[str, ...],
     known: options.Named,
     models: options.Named,
     board: str | None,
     estimation: Estimation,
-    plots: Plots,
-    html: str | None,
-    lean: bool,
-    as_json: bool,
-    output: str,
+    outputs: Outputs,
 ) -> None:
     """Calibrate a rig of any number of cameras, and their poses relative to the first.
 
@@ -132,7 +128,7 @@ def rig(
     named = [named_file(file) for file in files]
     inputs = [file for _, file in named]
     read = *inputs, board, *(file for _, file in known)
-    preparation.check(read, (output, html), plots=plots, as_json=as_json)
+    outputs.check(read)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.commands.show.rig_report import rig_json, rig_report
     from neurocal_cli.files.result_files import write_result
@@ -154,12 +150,9 @@ def rig(
         points[name], camera_options[name] = own.prepare(one)
     with ProgressBar() as progress:
         found = calibrate_rig(points, camera_options, outliers=estimation.outliers, progress=progress)
-    with concluding(found, as_json, rig_json, rig_report):
-        if not preparation.is_for_the_eye(output, "rig.yaml"):
-            warn(*write_result(found, output, lean=lean))
-        plot_result(plots, found)
-        write_page(html, found, *inputs)
-        suggest(output, "neurocal evaluate {}", "neurocal triangulate {} POINTS.csv -o XYZ.csv")
+    write = partial(write_result, lean=outputs.lean)
+    with outputs.concluding(found, rig_json, rig_report, write, inputs):
+        suggest(outputs.output, "neurocal evaluate {}", "neurocal triangulate {} POINTS.csv -o XYZ.csv")
 
 
 @click.command(cls=options.Command)
@@ -181,11 +174,12 @@ def rig(
     "LEFT.yaml RIGHT.yaml",
     "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@plot_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
-@html_option
-@options.lean
-@options.summary
-@options.output("RIG.yaml", "Write the rig to this file.")
+@outputs(
+    "RIG.yaml",
+    "Write the rig to this file.",
+    "the residuals, coverage and uncertainty of both cameras and the poses",
+    RIG_PANELS,
+)
 def stereo(
     left: str,
     right: str,
@@ -195,11 +189,7 @@ def stereo(
     right_intrinsics: str | None,
     alpha: float | None,
     ros: tuple[str, str] | None,
-    plots: Plots,
-    html: str | None,
-    lean: bool,
-    as_json: bool,
-    output: str,
+    outputs: Outputs,
 ) -> None:
     """Calibrate two cameras and the pose of the right one relative to the left one.
 
@@ -258,7 +248,7 @@ def stereo(
         known += ["type"] if estimation.type == "2" else []
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
-    preparation.check((*inputs, board), (output, html, *ros_files), plots=plots, as_json=as_json)
+    outputs.check((*inputs, board), *ros_files)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
     from neurocal_cli.commands.show.rig_report import stereo_json, stereo_report, views_alone
     from neurocal_cli.files.result_files import write_result
@@ -271,17 +261,14 @@ def stereo(
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     note(*views_alone(rig.alone))
-    with concluding(rig, as_json, stereo_json, stereo_report):
-        if not preparation.is_for_the_eye(output, "rig.yaml"):
-            warn(*write_result(rig, output, lean=lean, alpha=alpha))
+    write = partial(write_result, lean=outputs.lean, alpha=alpha)
+    with outputs.concluding(rig, stereo_json, stereo_report, write, inputs):
         if ros is not None:
             from neurocal_cli.files.rig_yaml import format_ros_pair
 
             for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
                 write_whole(name, text)
-        plot_result(plots, rig)
-        write_page(html, rig, *inputs)
-        suggest(output, "neurocal evaluate {}", "neurocal rectify {} LEFT... RIGHT... -o DIR")
+        suggest(outputs.output, "neurocal evaluate {}", "neurocal rectify {} LEFT... RIGHT... -o DIR")
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

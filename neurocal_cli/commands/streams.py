@@ -34,7 +34,6 @@ TYPED, NEXT = "neurocal.typed", "neurocal.next"
 
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
-_NOT_CONVERGED = 3  # exit status
 _PATIENCE = 0.5  # seconds after which the bar appears
 _SHORT = 0.3  # the same while modules and files are read
 _MOST_NAMED = 3  # files in a folder whose names are told
@@ -294,26 +293,13 @@ def tell_more(text: str) -> None:
         tell(one_line(text))
 
 
-@contextmanager
-def concluding(
-    result: Any, as_json: bool, in_json: Callable[[Any], dict[str, Any]], in_words: Callable[[Any], str]
-) -> Iterator[None]:
-    """Show the summary of a result and its warnings, and then write the outputs inside.
-
-    As JSON, it is printed after them. In the end, exit if the training did not converge.
-    """
+def tell_summary(tree: Callable[[], dict[str, Any]], words: Callable[[], str] | None) -> None:
+    """Show the summary of a result in words, unless there are none, and keep it for a batch."""
     if (capture := _CAPTURE.get()) is not None:
-        capture.summaries.append(for_json(in_json(result)))
-    if not as_json:
+        capture.summaries.append(for_json(tree()))
+    if words is not None:
         with drawn_on(sys.stderr if capture is None else None):
-            say(in_words(result))
-        warn(*result.warnings)
-    yield
-    if as_json:
-        print_summary(in_json(result))
-        warn(*result.warnings)
-    if not result.converged:
-        click.get_current_context().exit(_NOT_CONVERGED)
+            say(words())
 
 
 def print_text(made: Callable[[], str]) -> None:
