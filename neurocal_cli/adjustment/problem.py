@@ -22,7 +22,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhol
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, rotation_to_axis
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
-from neurocal_cli.camera.projection import ENTRIES, image_points
+from neurocal_cli.camera.projection import ENTRIES, ENTRY_NAMES, image_points
 from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError, UsageError, check_kind
@@ -32,7 +32,6 @@ _LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's m
 _LARGEST = 1e9  # px; no image is larger
 # Noise puts pixels at most this share of their distance from the centre beyond the lens's domain.
 _RIM, _HALVINGS = 0.02, 30
-_PARAMETERS = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # in the order of A's entries, each given with one
 _SINGLE = ("alpha_u", "alpha_v", "u0", "v0")  # those that can be fixed one by one
 _HOLDING = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")  # models whose coefficients can be fixed
 
@@ -231,12 +230,12 @@ def problem_for(
     held: dict[str, float] = {}
     for name, number in (fix or {}).items():
         _check_fixed(name, number, given, type, skew, distortion.model)
-        (given if name in _PARAMETERS else held)[name] = float(number)
+        (given if name in ENTRY_NAMES else held)[name] = float(number)
     known = coefficient_names(distortion.model) if type == 3 else held
-    entries = np.array([given.get(name, 0.0) for name in _PARAMETERS])
+    entries = np.array([given.get(name, 0.0) for name in ENTRY_NAMES])
     free_distortion = type != 3 and distortion.model != "none"
     views, turned = _views_of(points, distortion, entries, free_distortion)
-    free = np.array([name not in given for name in _PARAMETERS])
+    free = np.array([name not in given for name in ENTRY_NAMES])
     fixed, tied = frozenset((*given, *known)), square and "alpha_u" not in given
     return Problem(
         points, views, type, entries, free, poses, fixed, intrinsics, distortion, free_distortion,
@@ -265,7 +264,7 @@ def _entries_of(intrinsics: Intrinsics | None) -> dict[str, float]:
             "the given intrinsics are out of range: alpha and the centre must be of the size of an "
             "image; correct them"
         )
-    return dict(zip(_PARAMETERS, entries.tolist(), strict=True))
+    return dict(zip(ENTRY_NAMES, entries.tolist(), strict=True))
 
 
 def _both_alphas(fix: Mapping[str, float], type: int, skew: bool) -> Mapping[str, float]:

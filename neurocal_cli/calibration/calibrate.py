@@ -66,12 +66,8 @@ DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = get_args(Outliers)
 SKEWS = get_args(Skew)
 _CHOICES = {
-    "method": METHODS,
-    "trainer": TRAINERS,
-    "distortion": DISTORTIONS,
-    "outliers": OUTLIERS,
-    "target": TARGETS,
-}
+    "method": METHODS, "trainer": TRAINERS, "distortion": DISTORTIONS, "outliers": OUTLIERS, "target": TARGETS,
+}  # fmt: skip
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
@@ -189,7 +185,9 @@ def calibrate(
 
         several, told = arranged({camera_name: points}, target, fitted, lambda found: {camera_name: found})
         return replace(several, warnings=(*told, *several.warnings))
-    known_target = replace(target, bends=None) if isinstance(target, Target) else None
+    known_target = target if isinstance(target, Target) else None
+    if known_target is not None and known_target.bends is not None:  # cameras of a rig share the same one
+        known_target = replace(known_target, bends=None)
     choice = "given" if isinstance(target, Target) else target
     _check_options(
         starts, seed, preferred,
@@ -242,9 +240,8 @@ def calibrate(
         raise DegenerateGeometryError(explained) from error
     if isinstance(intrinsics, Calibration):
         found = with_given_covariance(found, intrinsics)
-    if isinstance(intrinsics, (Camera, Calibration)) and (why := undistorted_before(points, intrinsics)):
-        unused = (*unused, why)
-    return replace(found, warnings=(*found.warnings, *unused), judgement=assess)
+    undone = () if intrinsics is None else undistorted_before(points, intrinsics)
+    return replace(found, warnings=(*found.warnings, *unused, *undone), judgement=assess)
 
 
 def _explained(error: DegenerateGeometryError, points: Correspondences, type: int) -> str:

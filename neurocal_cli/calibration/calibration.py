@@ -21,6 +21,7 @@ from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, ProjectedPoints
 from neurocal_cli.camera.opencv_names import camera_info, opencv_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projection import ENTRY_NAMES
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError
@@ -29,7 +30,6 @@ from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
 _MOST_SHOWN = 5  # coefficients, on a line
-_ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # what A11, A12, A22, A13, A23 determine
 
 
 class StopReason(str, Enum):
@@ -396,7 +396,7 @@ def fixed_intrinsics(calibration: Calibration) -> dict[str, float]:
 
 def free_entries(calibration: Calibration, held: Collection[str] = ()) -> NDArray[np.bool_]:
     """(5 + K,) which of A11, A12, A22, A13, A23 and the coefficients are unknowns, neither given nor held."""
-    names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
+    names = (*ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
     free = np.array([name not in calibration.fixed and name not in held for name in names])
     free[2] &= not calibration.square_pixels
     return free
@@ -419,17 +419,19 @@ def spare_equations(calibration: Calibration) -> float:
     return float(equations(points.across, len(points)).sum()) - unknowns
 
 
-def undistorted_before(points: Correspondences, given: Camera | Calibration) -> str:
-    """Why a camera with distortion does not belong to points that are undistorted already; "" if it may.
+def undistorted_before(
+    points: Correspondences, given: Camera | Calibration | Intrinsics | Array
+) -> tuple[str, ...]:
+    """Why a camera with distortion does not belong to points that are undistorted already, if it does not.
 
     A camera that was calibrated from undistorted points has the distortion that these have left.
     """
     if not points.undistorted or camera_of(given).distortion.is_identity:
-        return ""
+        return ()
     if isinstance(given, Calibration) and given.points.undistorted:
-        return ""
+        return ()
     return (
         f"{points.source}: the points are undistorted already, so the camera's distortion "
         f"({camera_of(given).distortion.model}) is not theirs, unless the camera was calibrated from "
-        "undistorted points; give the points as they were measured, or a camera without distortion"
+        "undistorted points; give the points as they were measured, or a camera without distortion",
     )

@@ -102,59 +102,58 @@ def evaluate_camera(
     DegenerateGeometryError
         The points of a new view do not determine its pose.
     """
-    warnings: list[str] = []
+    if points is not None:
+        check_kind("points", points, Correspondences, "what read_points made")
+    given, seed, renamed = points, 0, tuple[str, ...]()
     poses: dict[str, Pose] = {}
-    renamed: tuple[str, ...] = ()
-    fit: Calibration | None = None
-    seed = 0
-    given = points
-    if given is not None:
-        check_kind("points", given, Correspondences, "what read_points made")
+    warnings: list[str] = []
     if isinstance(calibration, Calibration):
-        points = calibration.points if points is None else points
-        if not len(points):
-            raise InputError("the calibration has no points of its own; give the points to evaluate it on")
-        refuse_another_size(calibration, points)
         seed = calibration.seed
-        poses = {name: view.pose for name, view in calibration.views.items()}
-        if given is not None and calibration.target is not None:
-            points = laid(calibration.target, given)
-        if given is not None:
-            renamed = other_images(calibration, points)
-            poses = {name: pose for name, pose in poses.items() if name not in renamed}
-            if points.unit != calibration.unit and not poses.keys().isdisjoint(points.view_names):
-                warnings.append(
-                    f"the points are in {points.unit}, but the poses of the calibration are in "
-                    f"{calibration.unit}; the error is wrong unless these are the same unit"
-                )
+        points, poses, renamed = _own_views(calibration, given)
+        if points.unit != calibration.unit and not poses.keys().isdisjoint(points.view_names):
+            warnings.append(
+                f"the points are in {points.unit}, but the poses of the calibration are in "
+                f"{calibration.unit}; the error is wrong unless these are the same unit"
+            )
     elif points is None:
         raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
-    if isinstance(calibration, (Camera, Calibration)) and (why := undistorted_before(points, calibration)):
-        warnings.append(why)
-    fitted = np.array([name not in poses for name in points.view_names])
+    warnings += undistorted_before(points, calibration)
+    fitted, fit = np.array([name not in poses for name in points.view_names]), None
     if fitted.any():
         from neurocal_cli.calibration.calibrate import fit_poses
 
         fit = fit_poses(points.select(fitted[points.view_index]), calibration, seed)
-        poses.update({name: view.pose for name, view in fit.views.items()})
+        poses |= {name: view.pose for name, view in fit.views.items()}
         warnings += [f"fitting the poses of the new views: {text}" for text in fit.warnings]
         if not fit.converged:
             warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
-    camera = camera_of(calibration)
-    predicted, in_front = predict(camera, [poses[name] for name in points.view_names], points)
-    residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
+    predicted, in_front = predict(camera_of(calibration), [poses[name] for name in points.view_names], points)
     if not in_front.all():
         n_behind = np.count_nonzero(~in_front)
         warnings.append(
             f"{n_behind} of {len(points)} points lie behind the camera and are left out of all averages"
         )
     return replace(
-        _measure(residuals, points, fitted),
+        _measure(np.where(in_front[:, None], predicted - points.pixels, np.nan), points, fitted),
         warnings=tuple(warnings),
         renamed=renamed,
         fit=fit,
         on_target=given is not None and points is not given,
     )
+
+
+def _own_views(
+    calibration: Calibration, given: Correspondences | None
+) -> tuple[Correspondences, dict[str, Pose], tuple[str, ...]]:
+    """The points, on the estimated target, with the poses that are known; and views of other images."""
+    points = calibration.points if given is None else given
+    if not len(points):
+        raise InputError("the calibration has no points of its own; give the points to evaluate it on")
+    refuse_another_size(calibration, points)
+    if given is not None and calibration.target is not None:
+        points = laid(calibration.target, given)
+    renamed = () if given is None else other_images(calibration, points)
+    return points, {n: view.pose for n, view in calibration.views.items() if n not in renamed}, renamed
 
 
 def refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
@@ -232,7 +231,7 @@ def judged_by_points(
     finding = given_error(
         verdict, calibration.rmse_px, calibration.points, (seen**2).sum(axis=1), given.n_points
     )
-    return with_findings(verdict, [finding, *given_camera(calibration, given.fit), *changed_camera(drift)])
+    return with_findings(verdict, [finding, *given_camera(given.fit), *changed_camera(drift)])
 
 
 def changed_camera(drift: Drift | None) -> list[Finding]:
@@ -250,7 +249,7 @@ def changed_camera(drift: Drift | None) -> list[Finding]:
     return [(1, reason, "use a calibration from the new points")]
 
 
-def given_camera(calibration: Calibration, fit: Calibration | None) -> list[Finding]:
+def given_camera(fit: Calibration | None) -> list[Finding]:
     """Findings about the camera from views whose poses were fitted with it."""
     held = None if fit is None else gather_evidence(fit).contest
     return [] if fit is None or held is None else against_given(held, fit)

@@ -45,25 +45,8 @@ def calibration_of(
 
     Raises `DegenerateGeometryError` if the points do not determine the camera.
     """
-    problem, adjusted, record = solution.problem, solution.adjusted, solution.record
-    views, state = problem.views, adjusted.state
-    at, posterior = solution.target_posterior or (None, None)
-    if at is not adjusted:  # the camera has been adjusted again
-        posterior = None
-    known = camera_covariance(
-        CameraSeen(
-            problem.minimum(adjusted, solution.repeated),
-            problem.points,
-            solution.target,
-            posterior,
-            tuple(solution.model_errors or ()),
-            solution.shared,
-            solution.by_prior,
-            solution.target_kept,
-            solution.covariance if solution.target is None else None,
-            solution.alike,
-        )
-    )
+    problem, views, state = solution.problem, solution.problem.views, solution.state
+    known = _covariance_of(solution)
     refuse_undetermined(problem, state, known.plain)
     A = problem.matrix(state.entries[0])
     if problem.type != 3 and not problem.free[1]:
@@ -79,11 +62,9 @@ def calibration_of(
     rmse = float(np.sqrt(squared.mean()))
     free = tuple(parameter for parameter in std if parameter not in fixed)
     places = [n for n, parameter in enumerate(std) if parameter in free]
-    reason = StopReason.CONVERGED
-    if not adjusted.converged:
+    reason = StopReason.CONVERGED if solution.record.certain else StopReason.NO_AGREEMENT
+    if not solution.adjusted.converged:
         reason = StopReason.MAX_ITERATIONS
-    elif not record.certain:
-        reason = StopReason.NO_AGREEMENT
     chosen = solution.model_errors is not None
     found, second = _with_second_poses(solution, _view_results(solution, known.found, squared))
     return Calibration(
@@ -140,6 +121,25 @@ def with_given_covariance(found: Calibration, given: Calibration) -> Calibration
         both = {one: float(np.hypot(std[one], by)) for one, by in zip(POSE_NAMES, more, strict=True)}
         results[name] = replace(found.views[name], std=both)
     return replace(found, views=results, given_covariance=covariance, given_names=names)
+
+
+def _covariance_of(solution: Solution) -> CameraCovariance:
+    """The covariance of camera and poses, normalised."""
+    at, posterior = solution.target_posterior or (None, None)
+    return camera_covariance(
+        CameraSeen(
+            solution.problem.minimum(solution.adjusted, solution.repeated),
+            solution.problem.points,
+            solution.target,
+            posterior if at is solution.adjusted else None,  # or the camera has been adjusted again
+            tuple(solution.model_errors or ()),
+            solution.shared,
+            solution.by_prior,
+            solution.target_kept,
+            solution.covariance if solution.target is None else None,
+            solution.alike,
+        )
+    )
 
 
 def _entries(solution: Solution, known: CameraCovariance) -> Array:

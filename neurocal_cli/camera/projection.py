@@ -26,6 +26,7 @@ from neurocal_cli.camera.polynomial import Coefficients
 
 # Rows and columns of A's free entries, in the order of every vector of intrinsics: A11, A12, A22, A13, A23.
 ENTRIES = (np.array([0, 0, 1, 0, 1]), np.array([0, 1, 1, 2, 2]))
+ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of the parameters that determine them
 
 # A11, A12, A22, A13, A23.
 Entries = Sequence[Any] | Array

@@ -52,12 +52,16 @@ class _Workers:
     def run(self, stack: ExitStack, folder: str) -> Run:
         """What does tasks: processes of this machine, or the workers of a cluster."""
         from neurocal_cli.commands import cluster
+        from neurocal_cli.files.batch_files import owner_of
         from neurocal_cli.files.processes import usable_cores, work_off
 
         if self.scheduler is not None:
             client = stack.enter_context(cluster.running_cluster(self.scheduler))
-            if not self.ship:
-                _check_shared(client, folder)
+            if not self.ship and (blind := cluster.see(client, *owner_of(folder))):
+                raise NeurocalError(
+                    f"the worker {blind[0]} does not see {folder}; put it where all workers see it, or give "
+                    "--ship"
+                )
         elif self.jobs is not None or not cluster.is_installed():
             return lambda work, tasks: work_off(work, tasks, self.jobs or usable_cores())
         else:
@@ -174,19 +178,6 @@ def batch(
         stack.enter_context(locked(folder))
         run = cache(lambda: workers.run(stack, folder))
         _Batch(folder, output, todo, run, workers.ship, force).carry_out(former, as_json)
-
-
-def _check_shared(client: Any, folder: str) -> None:
-    """Refuse workers that do not see the folder of the results."""
-    from neurocal_cli.commands import cluster
-    from neurocal_cli.files.batch_files import owner_of
-
-    path, owner = owner_of(folder)
-    blind = cluster.see(client, path, owner)
-    if blind:
-        raise NeurocalError(
-            f"the worker {blind[0]} does not see {folder}; put it where all workers see it, or give --ship"
-        )
 
 
 class _Batch:

@@ -26,6 +26,7 @@ Words = tuple[str, ...]
 
 LOG = "log.txt"
 _REPORT = "report.html"
+_SOURCE = re.compile(r"images|points|right|lens|cam\d+").fullmatch
 # Options that a batch decides itself.
 _OWN = {"output", "html", "plots", "as_json", "jobs", "overlay", "cache", "watch", "ros", "points"}
 _RENAMED = {"measure": "--points"}  # of detect, whose name is that of a source
@@ -68,7 +69,7 @@ def job_of(one: DataSet, common: Mapping[str, str], output: str) -> Job:
     unknown or contradicts others.
     """
     cells = dict(one.cells)
-    sources = {name: cells.pop(name) for name in [*cells] if _is_source(name)}
+    sources = {name: cells.pop(name) for name in [*cells] if _SOURCE(name)}
     placed = {name: (value, os.curdir) for name, value in common.items()}
     placed |= {name: (value, one.folder) for name, value in cells.items()}
     try:
@@ -79,10 +80,6 @@ def job_of(one: DataSet, common: Mapping[str, str], output: str) -> Job:
         raise InputError(f"{one.place}: {error.format_message()}") from error
     except NeurocalError as error:
         raise InputError(f"{one.place}: {error}") from error
-
-
-def _is_source(column: str) -> bool:
-    return column in ("images", "points", "right", "lens") or re.fullmatch(r"cam\d+", column) is not None
 
 
 class _Maker:
@@ -146,7 +143,8 @@ class _Maker:
                     words = (*words, *self._typed(option, *cell))
             steps[k] = words
             parsed(words)  # so that wrong usage is found before any work
-        unused = [column for column in cells if column not in used and not _is_detection(column)]
+        detect = command_of(("detect",))  # whose options are not needed for points that are given
+        unused = [column for column in cells if column not in used and _option(detect, column) is None]
         if unused:
             raise InputError(
                 f"{unused[0]} is no option of neurocal {steps[-1][0]}; name columns as its options without --"
@@ -220,8 +218,3 @@ def _option(command: click.Command, column: str) -> click.Option | None:
         if isinstance(option, click.Option) and wanted in option.opts and free:
             return option
     return None
-
-
-def _is_detection(column: str) -> bool:
-    """Whether a column is an option of detect, which points that are given do not need."""
-    return _option(command_of(("detect",)), column) is not None

@@ -395,6 +395,5 @@ def _with_poses(name: str, points: Correspondences) -> Calibration:
             return camera
         note(f"{name}: holds no poses; they are fitted")
     assert seen is not None
-    if why := undistorted_before(seen, camera):
-        warn(why)
+    warn(*undistorted_before(seen, camera))
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")

@@ -228,8 +228,7 @@ class _Work:
         from neurocal_cli.files.points_csv import read_points
 
         points = noted(read_points, path)
-        if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
-            warn(why)
+        warn(*undistorted_before(points, (self.rig.left, self.rig.right)[side]))
         moved = rectify_points(self.pair, side, points)
         if len(moved) < len(points):
             note(

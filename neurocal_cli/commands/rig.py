@@ -12,7 +12,7 @@ import click
 from neurocal_cli.commands import boards, options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.outcome import Outputs, outputs
-from neurocal_cli.commands.show import RIG_PANELS
+from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.streams import ProgressBar, note, noted, suggest
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.writing import write_whole
@@ -178,7 +178,7 @@ def rig(
     "RIG.yaml",
     "Write the rig to this file.",
     "the residuals, coverage and uncertainty of both cameras and the poses",
-    RIG_PANELS,
+    CAMERA_PANELS,
 )
 def stereo(
     left: str,

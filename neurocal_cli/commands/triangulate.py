@@ -130,7 +130,10 @@ def triangulate(
         options.note_unused("with --plane", "epipolar_limit")
         _on_plane(inputs[0], inputs[1], plane, sigma, as_json, output)
         return
-    if len(inputs) == 2 and _of_many(inputs[0], inputs[1]):
+    from neurocal_cli.files.camera_tree import own_kind, read_tree
+    from neurocal_cli.files.measurement_csv import MATCHES, format_space_points, has_sightings
+
+    if len(inputs) == 2 and (has_sightings(inputs[1]) or own_kind(read_tree(inputs[0])) == "rig"):
         _triangulate_many(inputs[0], inputs[1], sigma, epipolar_limit, as_json, output)
         return
     rig = _rig(inputs[:-1])
@@ -138,7 +141,6 @@ def triangulate(
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
-    from neurocal_cli.files.measurement_csv import MATCHES, format_space_points
 
     sigma = _sigma_of(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
@@ -212,14 +214,6 @@ def _on_plane(camera: str, pixels: str, view: str, sigma: float | None, as_json:
     std = {"calibration": of_camera, "pixels": of_pixel}
     counts = {"n_points": len(variances) + missed, "n_behind": missed, "std": std}
     summarise(as_json, counts, ", ".join(told))
-
-
-def _of_many(rig: str, matches: str) -> bool:
-    """Whether the rig has other than two cameras, or the matches are those of named cameras."""
-    from neurocal_cli.files.camera_tree import own_kind, read_tree
-    from neurocal_cli.files.measurement_csv import has_sightings
-
-    return has_sightings(matches) or own_kind(read_tree(rig)) == "rig"
 
 
 def _triangulate_many(

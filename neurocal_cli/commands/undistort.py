@@ -144,14 +144,16 @@ def undistort(
     original = camera_of(preparation.known_camera(camera))
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
     work = _Undistorting(original, view, interpolation, original.image_size)
-    failed = work.correct_all(paths, outputs)
+    places = list(zip(paths, outputs, strict=True))
+    reasons = each_of(places, work.correct, "files", "undistorted") if places else {}
+    failed = {paths[k]: reason for k, reason in reasons.items()}
     note_once(work.notes)
     if new_camera is not None:
         work.write_camera(new_camera)
     if maps is not None:
         work.write_maps(maps)
     if as_json:
-        written = {path: place for path, place in zip(paths, outputs, strict=True) if path not in failed}
+        written = {path: place for path, place in places if path not in failed}
         print_summary({"files": written, "failed": failed, **work.summary()})
         return
     work.tell_loss()
@@ -243,12 +245,6 @@ class _Undistorting:
             )
         return Remapping(self.camera, self.new(), self.size, self.interpolation)
 
-    def correct_all(self, paths: Sequence[str], outputs: Sequence[str]) -> dict[str, str]:
-        """Undistort all files; return those that failed, with the reasons. A single file raises."""
-        places = list(zip(paths, outputs, strict=True))
-        failed = each_of(places, self._correct, "files", "undistorted") if places else {}
-        return {paths[k]: reason for k, reason in failed.items()}
-
     def tell_loss(self) -> None:
         """Report the part of a wide lens's field of view that the results lose."""
         if not self.camera.distortion.wide or self.size is None:
@@ -309,7 +305,7 @@ class _Undistorting:
             return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}
         return {"projection": "plane", "K": new.A}
 
-    def _correct(self, place: tuple[str, str]) -> None:
+    def correct(self, place: tuple[str, str]) -> None:
         """Undistort a file to its output."""
         path, output = place
         content = self._image(path, output) if is_image(path) else self._points(path)
@@ -342,8 +338,7 @@ class _Undistorting:
                 f"{points.source}: the image_size is {own}, but the camera is for {there}; "
                 f"{preparation.camera_of_size(points.image_size)}"
             )
-        if why := undistorted_before(points, self.camera):
-            warn(why)
+        warn(*undistorted_before(points, self.camera))
         new = self.new()
         points = replace(points, image_size=self.size)
         kept = shown(points, self.camera, new)

@@ -22,20 +22,18 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import value_failures
 from neurocal_cli.files.board_kinds import COUNTED, KINDS, kind_of, plane_of, read_plane, values_of
 from neurocal_cli.files.camera_tree import parse_tree
-from neurocal_cli.files.key_tables import Keys, inline
+from neurocal_cli.files.key_tables import Keys
 from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field, plain
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.files.yaml_text import flow, indented, list_lines, mapping, parse_yaml, quoted, text
+from neurocal_cli.files.yaml_text import flow, indented, list_lines, mapping, parse_yaml, text
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.markers import DICTIONARIES
 
 _VECTORS = ("origin", "x_axis", "y_axis")
 _OWN_KEYS = ("name", *_VECTORS, "points", "kind")
-_DISTANCE = Keys(
-    "from=start: quoted, to=end: quoted, length: number, std: number", {"quoted": inline(Field.text, quoted)}
-)
+_DISTANCE = Keys("from=start: quoted, to=end: quoted, length: number, std: number")
 
 
 def read_board(path: str | Path) -> Board:

@@ -232,10 +232,7 @@ def _distance_lines(key: str, distances: Iterable[Distance], long: bool) -> Iter
 
 _OF_POINTS = Keys(
     "undistorted?: text, board?: quoted, distances?: distances",
-    {
-        "quoted": inline(Field.text, quoted, ""),
-        "distances": Kind(lambda field: tuple(map(_distance, field.items())), _distance_lines, ()),
-    },
+    {"distances": Kind(lambda field: tuple(map(_distance, field.items())), _distance_lines, ())},
 )
 _POINTS = Columns(
     f"view?: label, point?: label, world={' '.join(PLACE)}: number, pixels={' '.join(PIXEL)}: number, "

@@ -313,6 +313,7 @@ def _stated_text(stated: Stated) -> str:
 
 _KINDS = {
     "text": inline(Field.text, lambda value: text(str.__str__(value)), ""),
+    "quoted": inline(Field.text, quoted, ""),
     "integer": inline(Field.integer, lambda value: str(int(value))),
     "boolean": inline(Field.boolean, boolean, False),
     "number": inline(Field.number, number, 0.0),

@@ -38,7 +38,7 @@ from neurocal_cli.files.table import Table, parse_table
 from neurocal_cli.files.table_header import Schema, column_names
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, quoted, text
+from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, text
 
 _FORMAT = 2
 _BLOCK = "neurocal_lens"
@@ -133,10 +133,7 @@ _FIT = Keys(
 )
 _REJECTED = Keys(
     "setting: setting, reason: quoted",
-    {
-        "setting": inline(lambda f: tuple(f.array(-1).tolist()), lambda setting: flow(np.array(setting))),
-        "quoted": inline(Field.text, quoted),
-    },
+    {"setting": inline(lambda f: tuple(f.array(-1).tolist()), lambda setting: flow(np.array(setting)))},
 )
 _HEAD = Keys(
     "controls: names, parameters=names: names, distortion=model: text, camera: text,"

@@ -19,7 +19,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
 from neurocal_cli.calibration.rig.rig import StereoRig
-from neurocal_cli.commands.show import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
+from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.show.camera_panels import Subject
 from neurocal_cli.commands.show.plot_pages import draw_camera, draw_points_in_space, draw_stereo
 
@@ -90,7 +90,7 @@ def rig() -> StereoRig:
     return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
 
 
-@pytest.mark.parametrize("panel", slow_but(("poses",), (None, *RIG_PANELS)))
+@pytest.mark.parametrize("panel", slow_but(("poses",), (None, *CAMERA_PANELS)))
 def test_a_rig_is_drawn(rig: StereoRig, panel: str | None) -> None:
     assert draw_stereo(rig, "png", panel).startswith(BEGINNINGS["png"])
 

@@ -111,16 +111,15 @@ def _with_other_starts(
     fitted: dict[str, Candidate], solution: Solution, more_starts: Starts, by_views: bool
 ) -> dict[str, Candidate]:
     """Fit from other starts if the present fits may be local minima; the best of all fits of each model."""
-    problem, views = solution.problem, solution.problem.views
-    limit = _limit(views, fitted)
+    limit = _limit(fitted)
     if limit == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
         return fitted
-    for start in more_starts(problem):
-        others = fit_candidates(problem, start, by_views)
+    for start in more_starts(solution.problem):
+        others = fit_candidates(solution.problem, start, by_views)
         if min((c.cost for c in others.values()), default=np.inf) < limit:
             better = {m: c for m, c in others.items() if m not in fitted or c.cost < fitted[m].cost}
             fitted = fitted | better
-        if (limit := _limit(views, fitted)) == 0:
+        if (limit := _limit(fitted)) == 0:
             break
     return fitted
 
@@ -139,7 +138,7 @@ def _may_lead_lower(
     return not np.isfinite(limit) or may_lead_lower(whole, limit / closest.cost, lowest)
 
 
-def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
+def _limit(fitted: dict[str, Candidate]) -> float:
     """Squared error below which the result of another start is accepted; 0: no other start is needed.
 
     It is infinite if free networks fit far better or no model is sound. If a focal length is poorly

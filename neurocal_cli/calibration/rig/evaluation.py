@@ -258,7 +258,7 @@ class _Evaluator:
                         f"{given.source} is in {given.unit}, but the calibration in {camera.unit}; give both "
                         "in one unit"
                     )
-                self.warnings += [why] if (why := undistorted_before(given, camera)) else []
+                self.warnings += undistorted_before(given, camera)
         self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
         self.pairs = pair_points(*self.points, self.views)
         known = [
@@ -348,10 +348,9 @@ class _Evaluator:
         findings = [given_error(verdict, rig.rmse_px, rig.left.points, squares, len(residuals), same)]
         if findings[0][0]:
             findings = [*self._other_size(rig, findings[0][0]), *findings]
-        fits = self.fitted or (None, None)
-        for side, camera, fit in zip(("left", "right"), self.cameras, fits, strict=True):
+        for side, fit in zip(("left", "right"), self.fitted or (None, None), strict=True):
             findings += [
-                (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(camera, fit)
+                (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(fit)
             ]
         return with_findings(verdict, findings)
 

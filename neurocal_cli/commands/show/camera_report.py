@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration.calibration import Calibration, Verdict, ViewResult, fixed_intrinsics
+from neurocal_cli.calibration.calibration import Calibration, Verdict, fixed_intrinsics
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.commands.show.text import (
@@ -181,7 +181,10 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         **attributes(calibration, "rmse_px max_px"),
         "views": {name: view.rmse_px for name, view in calibration.views.items()},
         "second_poses": {
-            name: [_pose_json(one) for one in (calibration.views[name], second)]
+            name: [
+                attributes(one, "probability") | attributes(one.pose, "R t")
+                for one in (calibration.views[name], second)
+            ]
             for name, second in calibration.second_poses.items()
         },
         "lens_choice": calibration.lens_choice,
@@ -198,11 +201,6 @@ def _positions_json(calibration: Calibration) -> dict[str, Any]:
     (view,) = calibration.views
     places = _position(calibration, view)
     return {view: {name: {"value": value, "std": std} for name, value, std in places}}
-
-
-def _pose_json(view: ViewResult) -> dict[str, Any]:
-    """A pose, and its probability where the flat target may be tilted the other way."""
-    return {"probability": view.probability, "R": view.pose.R, "t": view.pose.t}
 
 
 def target_lines(target: Target | None, unit: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,6 +53,7 @@ _LOOK = {
     "tsai": ("#e69f00", "^", 5.5),
     "opencv": ("#56b4e9", "+", 8.0),
 }
+_digits = partial(number, form=".4g")
 _OWN = 0.9  # a method whose bound is below this share of the largest one has its own line
 
 
@@ -139,11 +141,6 @@ def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
     winners = [method for method, error in known.items() if _digits(error) == _digits(best)]
     names = " and ".join([", ".join(winners[:-1]), winners[-1]] if len(winners) > 1 else winners)
     return [f"{what}: {names}, {_digits(best)}{unit}"]
-
-
-def _digits(value: float) -> str:
-    """Four significant digits."""
-    return number(value, ".4g")
 
 
 def _camera_json(one: Compared) -> dict[str, Any]:

@@ -151,7 +151,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
 
 
 def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw both cameras of a rig side by side, or one of `RIG_PANELS` for both; see `draw_camera`."""
+    """Draw both cameras of a rig side by side, or one of `CAMERA_PANELS` for both; see `draw_camera`."""
     sides = {"left": Subject.of(rig.left), "right": Subject.of(rig.right)}
     panels: dict[str, Draw] = {
         f"{side} {name}": _with_side(side, draw)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,7 @@ _TRAININGS = {
     "alternating": "trained alternately",
     "one at a time": "trained one at a time",
 }
+_pixels = partial(number, form=".3f")
 _FINE = 121  # points of a curve
 _MOST_CURVES = 6  # values of the second control; more are not legible
 _COLUMNS = 2
@@ -163,11 +165,6 @@ def _baseline_rows(evaluation: LensEvaluation) -> Table:
             joint = baselines.get(f"{name}_joint")
             rows.append([name.replace("_", " "), _pixels(alone), "" if joint is None else _pixels(joint)])
     return rows
-
-
-def _pixels(value: float) -> str:
-    """Three decimals."""
-    return number(value, ".3f")
 
 
 def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:

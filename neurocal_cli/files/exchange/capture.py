@@ -41,7 +41,7 @@ def _anipose_parts(document: Document) -> dict[str, Field]:
     parts = {}
     for key, part in _sections(document).items():
         if part.get("ignore", False).value is True:
-            document.notes.append(f"{document.source}: {key} is to be ignored, and is left out")
+            document.note(f"{key} is to be ignored, and is left out")
             continue
         if "fisheye" not in part and len(part["distortions"].array(-1)) == len(MODELS["fisheye"]):
             part.refuse(f"{key} has four coefficients; say fisheye = true, or false, for it")

@@ -54,9 +54,7 @@ def _argoverse_parts(document: Document) -> dict[str, Field]:
         for entry in document.root["camera_data_"].items()
     }
     if any(np.any(part["distortion_coefficients_"].value) for part in parts.values()):
-        document.notes.append(
-            f"{document.source}: Argoverse's own programs project without the distortion, which is read here"
-        )
+        document.note("Argoverse's own programs project without the distortion, which is read here")
     return parts
 
 

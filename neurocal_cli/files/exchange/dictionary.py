@@ -192,7 +192,7 @@ def _parts(document: Document) -> dict[str, Field]:
         pose = matrix_data(R, 9).tolist(), matrix_data(t, 3).tolist()
         trees[1] |= zip(_PLACED.paths, pose, strict=True)
     if document.is_script:
-        document.warnings.append(f"{document.source}: {FROM_ZERO}")
+        document.doubt(FROM_ZERO)
     trees[0] |= {key: root[key].value for key in (_ROWS, *_VECTORS, _VIEWS, _UNIT) if key in root}
     return {str(k): Field(tree, root.source) for k, tree in enumerate(trees)}
 
@@ -230,8 +230,7 @@ def with_sizes_noted(found: CameraSet, parts: Mapping[str, Field], document: Doc
         elif off > _OUTSIDE:
             doubt = f"far outside an image of {w} x {h}; check its size, and whether the images were cropped"
         if doubt is not None:
-            place = f"{document.source}: the principal point ({u0:.6g}, {v0:.6g})"
-            document.warnings.append(f"{place} is {doubt}")
+            document.doubt(f"the principal point ({u0:.6g}, {v0:.6g}) is {doubt}")
     return found
 
 

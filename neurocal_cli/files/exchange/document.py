@@ -109,6 +109,14 @@ class Document:
         self.distortion, self.size = distortion, size
         self.is_script = False  # of MATLAB or Octave, perhaps
 
+    def note(self, text: str) -> None:
+        """Append a remark about what was read."""
+        self.notes.append(f"{self.source}: {text}")
+
+    def doubt(self, text: str) -> None:
+        """Append a doubt about what was read."""
+        self.warnings.append(f"{self.source}: {text}")
+
     def with_tree(self, tree: dict[str, Any], source: str = "") -> Document:
         """The document with another tree, and without its text."""
         other = copy.copy(self)

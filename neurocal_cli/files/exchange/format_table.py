@@ -304,7 +304,7 @@ class Format(CameraKeys):
         for part in found.values():
             for path, remark in self.remarks.items():
                 if (stated := find(part, path)) is not None and (number := stated.number()) not in (0.0, 1.0):
-                    document.notes.append(f"{document.source}: {remark.format(number)}")
+                    document.note(remark.format(number))
         cameras = self._of_project(found) if self.project else self._mounted(found)
         if self.views is not None:
             cameras = replace(cameras, poses=self.views(next(iter(found.values()))))

@@ -51,10 +51,7 @@ def fitted(
             f"the {model} of this camera is no fisheye within {_WORST:g} px, but {error:.3g}; calibrate its "
             "images as fisheye, omnidir or rich"
         )
-    document.warnings.append(
-        f"{document.source}: {model} is no model here; the nearest fisheye moves pixels by {error:.2g} px "
-        "at most"
-    )
+    document.doubt(f"{model} is no model here; the nearest fisheye moves pixels by {error:.2g} px at most")
     return float(c[0]), Distortion("fisheye", c[1:] / c[0])
 
 
@@ -103,8 +100,8 @@ def _ocam_parts(document: Document) -> dict[str, Tree]:
     turn = np.arctan2(d, c)
     A = f * M @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     if abs(turn) > _STRAIGHT:
-        document.notes.append(
-            f"{document.source}: the camera is turned about its axis by {np.degrees(turn):.3g} degrees from "
+        document.note(
+            f"the camera is turned about its axis by {np.degrees(turn):.3g} degrees from "
             "OCamCalib's, so that its rows lie along x"
         )
     K = matrix_of(A[0, 0], A[1, 1], column, row, A[0, 1])
@@ -216,12 +213,12 @@ def _openptv_parts(document: Document) -> dict[str, Tree]:
         text, source = read_text(lens)
         k = in_order(LENS, text.split(), source)
     else:
-        document.warnings.append(f"{document.source}: there is no {lens.name}, so it has no distortion")
+        document.doubt(f"there is no {lens.name}, so it has no distortion")
     camera = _camera(own, k, pixels, document)
     R = _FLIP @ own["R"].array(9).reshape(3, 3).T
     pose = {"R": R.tolist(), "t": (-R @ own["place"].array(3)).tolist()}
     if broken:
-        document.notes.append(f"{document.source}: rays are broken at glass, so its pose is left out")
+        document.note("rays are broken at glass, so its pose is left out")
     tree = {"K": camera.A.tolist(), "D": camera.distortion.coefficients.tolist() or [0.0], "size": pixels[:2]}
     return {path.name.split(".")[0]: {**tree, **({} if broken else pose)}}
 
@@ -262,8 +259,8 @@ def _camera(own: Field, lens: Field, pixels: list[float], document: Document) ->
         raise InputError(
             f"no camera of OpenCV's is within {_WORST:g} px of this one; calibrate from its points"
         )
-    document.warnings.append(
-        f"{document.source}: OpenPTV's distortion is about the middle of the sensor; the nearest camera "
+    document.doubt(
+        f"OpenPTV's distortion is about the middle of the sensor; the nearest camera "
         f"about the principal point moves pixels by {worst:.2g} px at most"
     )
     return near

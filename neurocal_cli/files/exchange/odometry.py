@@ -22,8 +22,8 @@ from neurocal_cli.files.tree_fields import Field
 def _orb_parts(document: Document) -> dict[str, Field]:
     root = document.root
     if "LEFT.K" in root:
-        document.notes.append(
-            f"{document.source}: Camera.fx to Camera.cy are of the rectified images; LEFT.K, RIGHT.K and the "
+        document.note(
+            "Camera.fx to Camera.cy are of the rectified images; LEFT.K, RIGHT.K and the "
             "rest of the original cameras are not read"
         )
     if isinstance(document.tree.get("Camera"), dict):

@@ -100,9 +100,7 @@ def _visp_parts(document: Document) -> dict[str, Tree]:
         own = {child.tag: plain_value(child.text or "") for child in camera if not len(child)}
         models = camera.findall("model")
         if len(models) > 1:
-            document.notes.append(
-                f"{document.source}: holds the camera without distortion as well, which is passed over"
-            )
+            document.note("holds the camera without distortion as well, which is passed over")
         for model in models[-1:]:
             tree = own | {child.tag: plain_value(child.text or "") for child in model}
             parts[f"{own.get('name', 'camera')} {k}"] = tree
@@ -255,8 +253,8 @@ def _pix4d_parts(document: Document) -> dict[str, Field]:
         if found is None or not name:
             raise InputError(f"the block of the image {name[:40]!r} is damaged; export the file again")
         parts[name] = found
-    document.warnings.append(
-        f"{document.source}: Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
+    document.doubt(
+        "Pix4D does not say where its first pixel is; its centre is taken as (0, 0), "
         "which may be half a pixel off"
     )
     return parts

@@ -46,7 +46,7 @@ def _parts(document: Document) -> dict[str, Field]:
             tree[key] = matrix_data(found, count).tolist()
     keys.refuse_unread()
     if root.get("binning_x", 0).integer() > 1 or root.get("binning_y", 0).integer() > 1:
-        document.notes.append(f"{document.source}: has binning; the camera is that of the images before it")
+        document.note("has binning; the camera is that of the images before it")
     return {"camera": Field(tree, document.source)}
 
 
