@@ -66,7 +66,8 @@ DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = get_args(Outliers)
 SKEWS = get_args(Skew)
 _CHOICES = {
-    "method": METHODS, "trainer": TRAINERS, "distortion": DISTORTIONS, "outliers": OUTLIERS, "target": TARGETS,
+    "method": METHODS, "trainer": TRAINERS, "distortion": DISTORTIONS, "outliers": OUTLIERS,
+    "target": TARGETS,
 }  # fmt: skip
 
 _STARTS = 20

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from neurocal_cli.commands.boards import with_other_kind
 from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line, say
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, plural
+from neurocal_cli.files.writing import write_at_once
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,7 +45,7 @@ def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[st
 def _frames(path: str, folder: str, most: int) -> list[str]:
     """Choose frames of a video, and write them to a folder; their files."""
     from neurocal_cli.detection.batch import choose_frames
-    from neurocal_cli.files.images import frame_rate, save_frame, video_frames
+    from neurocal_cli.files.images import encode_png, frame_rate, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]
     with ProgressBar() as progress:
@@ -59,7 +60,7 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
     for number, grey in enumerate(video_frames(path)):
         if number in wanted:
             saved.append(os.path.join(folder, f"{name}_{number:06d}.png"))
-            save_frame(grey, saved[-1])
+            write_at_once(saved[-1], encode_png(grey))
     note(f"{path}: {len(saved)} of {number + 1} frames are sharp and differ from each other")
     return saved
 

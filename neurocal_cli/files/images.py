@@ -18,7 +18,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, one_line, reading_failures
 from neurocal_cli.files.image_files import Header, is_video_header, read_header
 from neurocal_cli.files.reading import read_bytes
-from neurocal_cli.files.writing import write_at_once
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
@@ -257,8 +256,3 @@ def frame_rate(path: str) -> float:
         rate = capture.get(cv2.CAP_PROP_FPS)
         capture.release()
     return rate if 0 < rate < _FASTEST else _USUAL
-
-
-def save_frame(grey: NDArray[np.uint8], path: str) -> None:
-    """Write a frame as PNG at once, whatever becomes of the command."""
-    write_at_once(path, encode_png(grey))

@@ -95,6 +95,12 @@ def _table(header: Sequence[str], names: Sequence[str], forms: str, parts: Itera
         yield "".join(f"{line}\n" for line in lines)
 
 
+def _frame(camera: str, unit: str, sigma: float) -> list[str]:
+    """Lines on the coordinates of points in space, those of a camera."""
+    frame = f"# frame: {camera}; X right, Y down, Z forward, the centre of its lens at 0"
+    return [frame, f"# unit: {unit}", f"# sigma: {sigma:.6g}"]
+
+
 # Ten digits of the coordinates, more than their accuracy; six digits of covariance and error.
 _IN_SPACE = "%.10g " * 3 + "%.6g " * 7
 _ON_PLANE = "%.10g " * 3 + "%.6g " * 3
@@ -115,12 +121,7 @@ def format_space_points(
         flags = _FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
         return labels, numbers, [flags]
 
-    header = [
-        "# frame: left camera; X right, Y down, Z forward, the centre of its lens at 0",
-        f"# unit: {unit}",
-        f"# sigma: {sigma:.6g}",
-        f"# epipolar_limit: {limit:.6g}",
-    ]
+    header = [*_frame("left camera", unit, sigma), f"# epipolar_limit: {limit:.6g}"]
     names = (*_SPACE, "epipolar", "flag")
     return _table(header, names, _IN_SPACE, (columns(*batch) for batch in batches))
 
@@ -129,12 +130,7 @@ def format_many_points(
     found: SpacePoints, names: Sequence[str], cameras: Sequence[str], *, unit: str, sigma: float, limit: float
 ) -> Iterator[str]:
     """Text of a file of points that any number of cameras saw; see `format_space_points`."""
-    header = [
-        f"# frame: camera {cameras[0]}; X right, Y down, Z forward, the centre of its lens at 0",
-        f"# unit: {unit}",
-        f"# sigma: {sigma:.6g}",
-        f"# error_limit: {limit:.6g}",
-    ]
+    header = [*_frame(f"camera {cameras[0]}", unit, sigma), f"# error_limit: {limit:.6g}"]
     numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.error])
     flags = _FLAGS[np.where(found.behind, 2, (~(found.error <= limit)).astype(int))].tolist()
     without = [quoted_field(cameras[k]) if k >= 0 else "" for k in found.contradicts]
