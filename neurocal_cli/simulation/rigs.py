@@ -29,6 +29,7 @@ _TRIES = 50  # places at which a board is held until some camera sees it
 # Turns a board that faces a camera to one that faces the first of two groups' middle, along the world's y
 # axis.
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_SQUARE = 80.0  # mm
 _LENSES = (Distortion("k1k2", np.array([-0.2, 0.06])), Distortion("k1k2", np.array([-0.1, 0.02])))
 _FISHEYE = Distortion("fisheye", np.array([0.02, -0.004, 0.001, 0.0]))
 
@@ -94,23 +95,15 @@ def _is_shown(camera: Camera, inside: Array, normal: Array) -> NDArray[np.bool_]
 
 
 def random_rig(
-    layout: str,
-    n_cameras: int,
-    n_frames: int,
-    rng: np.random.Generator,
-    *,
-    columns: int = 6,
-    rows: int = 5,
-    square: float = 80.0,
-    n_fisheyes: int = 0,
+    layout: str, n_cameras: int, n_frames: int, rng: np.random.Generator, *, n_fisheyes: int = 0
 ) -> SimulatedRig:
-    """A rig with a board of columns x rows corners at random places that at least one camera sees.
+    """A rig with a board of 6 x 5 corners at random places that at least one camera sees.
 
     The first `n_fisheyes` cameras have fisheye lenses. Raises UsageError for an unknown layout, and
     InputError if no place shows the board to a camera.
     """
     check_choice("layout", layout, LAYOUTS)
-    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2) * square
+    grid = np.stack(np.meshgrid(np.arange(6), np.arange(5)), -1).reshape(-1, 2) * _SQUARE
     board = np.column_stack([grid, np.zeros(len(grid))])
     cameras, mounted = {}, {}
     for k in range(n_cameras):
