@@ -60,7 +60,12 @@ from neurocal_cli.calibration.verdict.proportions import unlike_axes
 from neurocal_cli.calibration.verdict.rules import reach_verdict
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
-from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
+from neurocal_cli.camera.distortion import (
+    POLYNOMIAL_MODELS,
+    Distortion,
+    coefficient_names,
+    pinhole_coefficients,
+)
 from neurocal_cli.camera.geometry import Array, cross_matrix, median
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
@@ -193,13 +198,12 @@ class _AtMinimum:
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.errors = point_residuals(self.views, self.state)
         self.repeated = repeated_poses(self.views, self.state, self.errors)
-        known = camera_covariance(
-            CameraSeen(
-                Minimum(self.views, self.state, adjusted.normal, self.free, self.free_poses, self.repeated),
-                self.points, calibration.target, choice=tuple(calibration.lens_choice),
-                target_kept=calibration.target_stretched > 0,
-            )
+        self.seen = CameraSeen(
+            Minimum(self.views, self.state, adjusted.normal, self.free, self.free_poses, self.repeated),
+            self.points, calibration.target, choice=tuple(calibration.lens_choice),
+            target_kept=calibration.target_stretched > 0,
         )  # fmt: skip
+        known = camera_covariance(self.seen)
         self.minimum = known.basis.minimum
         self.spare = max(known.basis.n_equations - self.unknowns, 1)
         self.variance = self.cost / self.spare
@@ -255,7 +259,24 @@ class _AtMinimum:
             noise=(*stated, *self._survey(), *noise_shape(self.points, residuals, alike)),
             stated=bool(stated),
             mistake=self._mistake(contradiction),
+            lacking=self._lacking(),
         )
+
+    def _lacking(self) -> tuple[str, float]:
+        """The parameter that real lenses leave most uncertain beside a named one; see `Evidence`.
+
+        Its standard deviation is compared with that for a lens that was selected.
+        """
+        c = self.calibration
+        names = coefficient_names(c.distortion_model)
+        given = c.lens_choice or c.type == 3 or c.fixed & set(names) or c.straight_lines is not None
+        if given or "p1" in names or c.distortion_model == "rich" or self._is_exact():
+            return "", 1.0
+        wide = camera_covariance(replace(self.seen, choice=POLYNOMIAL_MODELS)).entries
+        ratio = np.sqrt(np.diagonal(wide) / np.diagonal(self.covariance))[: int(self.free[:5].sum())]
+        places = np.flatnonzero(self.free[:5])
+        found = max(zip(ratio.tolist(), places.tolist(), strict=True), default=(1.0, 0))
+        return ("alpha_u", "theta", "alpha_v", "u0", "v0")[found[1]], found[0]
 
     def _residuals(self) -> Array:
         """(N, 2) predicted minus observed [px], in the order of the points."""

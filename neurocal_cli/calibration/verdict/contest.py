@@ -280,9 +280,8 @@ def _steps(lin: Linearised, found: Estimate) -> Array:
     return own + steps
 
 
-# Std of the focal lengths and the centre by which a cause biases them, or by which given values and poses are
-# wrong.
-_BIASED = Limit(2.0, 5.0)
+BIASED = Limit(2.0, 5.0)
+"""Limits of a bias of the focal lengths and the centre, or of what is given or left out, over their std."""
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
 _LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
 
@@ -360,7 +359,7 @@ def _is_uncertain(found: Estimate, contest: Contest, calibration: Calibration) -
     alpha = float(lin.state.entries[0, 0]) * lin.views.pixel_scale
     names = ("alpha_u", "theta", "alpha_v", "u0", "v0")
     known = zip(places, found.amounts.tolist(), strict=True)
-    return all(abs(by) * alpha <= _BIASED.poor * std.get(names[k], 0.0) for k, by in known)
+    return all(abs(by) * alpha <= BIASED.poor * std.get(names[k], 0.0) for k, by in known)
 
 
 def closest(contest: Contest | None, calibration: Calibration) -> str:
@@ -375,7 +374,7 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal, contest.std_of_poses)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
-    if found.rival.of_given and told.moved_poses > _BIASED.poor:
+    if found.rival.of_given and told.moved_poses > BIASED.poor:
         grade = max(grade, 1 + int(found.explained > EXPLAINED))
     # Outliers were left out of the calibration, and what differs from view to view is in the std.
     if not contest.remains or not found.weights.size:
@@ -383,7 +382,7 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0
     )
-    by_bias = _BIASED.grade(max(biased, default=0.0))
+    by_bias = BIASED.grade(max(biased, default=0.0))
     return max(grade, min(by_bias, 1) if found.rival.of_distance else by_bias), reason
 
 

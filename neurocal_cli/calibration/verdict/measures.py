@@ -215,3 +215,6 @@ class Evidence:
     poses: int  # number of different poses among the views (`repeated_poses`)
     contest: Contest | None  # the causes of the residuals
     mistake: tuple[str, str] | None  # in the rows of all views, and what to do
+    # The parameter whose standard deviation grows most with what a named lens lacks and the points leave
+    # open, and by which factor.
+    lacking: tuple[str, float]

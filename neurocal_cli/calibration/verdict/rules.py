@@ -14,7 +14,7 @@ from neurocal_cli.calibration.calibration import (
     free_entries,
     spare_equations,
 )
-from neurocal_cli.calibration.verdict.contest import closest, explains
+from neurocal_cli.calibration.verdict.contest import BIASED, closest, explains
 from neurocal_cli.calibration.verdict.contest import findings as causes
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
@@ -41,6 +41,7 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.calibration.verdict.measures import Evidence
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
+from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import MISPRINT, Target
@@ -290,6 +291,14 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             f"the std of the image centre is {two_digits(centre)} px",
             more,
         )
+    name, times = e.lacking
+    told = e.contest is not None and any(one.rival in RICHER_LENSES for one in e.contest.causes)
+    yield (
+        0 if told else min(BIASED.grade(times), 1),
+        f"with p1 and p2 of real lenses, which {calibration.distortion_model} lacks and these points leave "
+        f"open, the std of {name} is {times:.2g} times as large",
+        "give --distortion auto, whose std include what the points leave open",
+    )
     if e.projection is not None and calibration.type != 3:
         worst = e.projection.worst
         diagonal = float(np.hypot(*(size or (np.nan, np.nan))))
