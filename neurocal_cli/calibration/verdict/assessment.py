@@ -270,7 +270,8 @@ class _AtMinimum:
         c = self.calibration
         names = coefficient_names(c.distortion_model)
         given = c.lens_choice or c.type == 3 or c.fixed & set(names) or c.straight_lines is not None
-        if given or "p1" in names or c.distortion_model == "rich" or self._is_exact():
+        # Without distortion are images that were undistorted.
+        if given or not names or "p1" in names or c.distortion_model == "rich" or self._is_exact():
             return "", 1.0
         wide = camera_covariance(replace(self.seen, choice=POLYNOMIAL_MODELS)).entries
         ratio = np.sqrt(np.diagonal(wide) / np.diagonal(self.covariance))[: int(self.free[:5].sum())]

@@ -49,7 +49,7 @@ _MOST = 3  # causes at once, and rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
 _MUCH = 0.3  # share of the evidence beside the target's shape, or of the error of a lens, that counts
-_FAR_MORE = 2.0  # times the log evidence of an estimated target
+_FAR_MORE = 2.0  # times the log evidence of an estimated target, or of given poses that are wrong
 
 
 @frozen_dataclass(eq=False)
@@ -81,8 +81,8 @@ class Contest:
         first = self.causes[0] if self.causes else None
         if first is None:
             return 0.0
-        if first.rival.effect in OF_POSES:  # the target would take in what is wrong with given poses
-            return float("inf")
+        if first.rival.effect in OF_POSES:  # the target takes in what is wrong with given poses
+            return _FAR_MORE * worth * self.evidence
         # A lens whose rays do not meet in one point says nothing against a shape that comes before it.
         beside = (no_pupil,) if first.rival.of_board else ()
         known = [one for one in self.causes if not (one.rival.unknown or one.rival.effect in beside)]
