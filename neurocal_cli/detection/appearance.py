@@ -16,8 +16,9 @@ its own colour at a distance t within a side, it is on the diagonal, as near to 
     s(t)^2 + s(-t)^2 - max(s(t) + s(-t) - 1, 0)^2
 
 The second term is the next square of that colour, and the last is what both share if they overlap. Round
-marks, squares with rounded corners, and those with gaps along one axis alone, such as windows in shifted
-rows, have less there. Squares that are not of one level have markers in them.
+marks and squares with rounded corners have less there. Ink spreads alike along both axes, and light by a
+share of the blur along each, while windows or bricks in shifted rows have gaps along one axis, or different
+ones. Squares that are not of one level have markers in them.
 """
 
 from __future__ import annotations
@@ -185,7 +186,7 @@ def _ruled(levels: Array, within: Array) -> float:
     return float((away - _SURE * noise).max(initial=0.0))
 
 
-_MOST, _FEWEST = 60, 4  # squares of a colour that are examined
+_MOST, _FEWEST = 60, 2  # squares of a colour that are examined
 _TO_SIDES = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
 _TO_CORNERS = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
 _BEYOND = 10  # steps
@@ -197,6 +198,10 @@ _CENTRE = weights_within(0.5 + 0.15 * np.concatenate([[[0, 0]], _TO_SIDES, _TO_C
 _FLAT = 18  # steps from which a square has one level: 0.2 of it
 # Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.02, circles 0.13.
 _ROUNDED, _ROUNDED_PX = 0.025, 0.5
+# Greatest difference of the places of the edges along both axes: squares (0.009 in 206 rendered boards, 0.007
+# in photographs; shifted rows 0.02 and more) and px, beyond this share of the difference of the blurs' widths,
+# by which overexposed light spreads.
+_UNEVEN, _UNEVEN_PX, _SPREAD = 0.015, 0.1, 0.3
 # Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
 # and 0.1 and more on boards with markers.
 _LEVEL = 0.07
@@ -205,17 +210,19 @@ _LEVEL = 0.07
 def are_squares(light: Image, pixels: Array, dark: int) -> bool:
     """Whether marks between vertices (rows, cols, 2) are squares; `dark` is that of `Grid`."""
     every = [(quads, own) for quads, own in _squares(light, pixels, dark) if len(own) >= _FEWEST]
-    return len(every) < 2 or all(_meet(quads, own) for quads, own in every)
+    plain = all(_is_plain(own) for _, own in every)
+    return len(every) < 2 or all(_meet(quads, own, plain) for quads, own in every)
 
 
 def are_plain(light: Image, pixels: Array, dark: int) -> bool:
     """Whether most squares of either colour are of one level, compared with the contrast of the board."""
-    spread = []
-    for _, own in _squares(light, pixels, dark):
-        # Means of some samples are hardly noisy.
-        parts = own[..., _FLAT:-1].reshape(len(own), -1, 6).mean(axis=2)
-        spread.append(float(np.median(parts.std(axis=1))) if len(own) else 0.0)
-    return max(spread) < _LEVEL
+    return all(_is_plain(own) for _, own in _squares(light, pixels, dark))
+
+
+def _is_plain(own: Array) -> bool:
+    # Means of some samples are hardly noisy.
+    parts = own[..., _FLAT:-1].reshape(len(own), -1, 6).mean(axis=2)
+    return not len(own) or float(np.median(parts.std(axis=1))) < _LEVEL
 
 
 def _squares(light: Image, pixels: Array, dark: int) -> list[tuple[Array, Array]]:
@@ -243,17 +250,21 @@ def _squares(light: Image, pixels: Array, dark: int) -> list[tuple[Array, Array]
     return result
 
 
-def _meet(quads: Array, own: Array) -> bool:
-    """Whether squares (N, 4, 2) of one colour have sharp corners, and no gaps along one axis alone."""
+def _meet(quads: Array, own: Array, plain: bool) -> bool:
+    """Whether squares (N, 4, 2) of one colour have sharp corners, and `plain` ones like gaps along both axes."""
     shares = np.median(own, axis=0)
-    side = max(shares[:4].reshape(2, 2, -1).mean(axis=1), key=lambda axis: float(axis.sum()))
-    corner = shares[4:].mean(axis=0)[_BEYOND:]
+    axes = shares[:4].reshape(2, 2, -1).mean(axis=1)
+    step = _DEPTH[1] - _DEPTH[0]
+    edges = [float(np.interp(0.5, np.maximum.accumulate(axis), _DEPTH)) for axis in axes]
+    blurs = step / np.maximum(np.diff(axes, axis=1).max(axis=1), 1e-9)
+    uneven = plain * (abs(edges[1] - edges[0]) - _SPREAD * abs(blurs[1] - blurs[0]))
+    side, corner = axes.mean(axis=0), shares[4:].mean(axis=0)[_BEYOND:]
     within, beyond = side[_BEYOND:], np.zeros(len(corner))
     beyond[: _BEYOND + 1] = side[_BEYOND::-1]
     expected = within**2 + beyond**2 - np.maximum(within + beyond - 1, 0) ** 2
-    lost = float((expected - corner).sum() * (_DEPTH[1] - _DEPTH[0]))
+    lost = float((expected - corner).sum() * step)
     along, down = quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0]
     area = np.abs(np.linalg.det(np.stack([along, down], axis=1)))
     longest = np.maximum(np.hypot(*along.T), np.hypot(*down.T))
-    width = float(np.median(area / longest))  # of squares that are seen from the side, the height
-    return lost < max(_ROUNDED, _ROUNDED_PX / max(width, 1.0))
+    width = max(float(np.median(area / longest)), 1.0)  # of squares that are seen from the side, the height
+    return lost < max(_ROUNDED, _ROUNDED_PX / width) and uneven < max(_UNEVEN, _UNEVEN_PX / width)
