@@ -198,9 +198,9 @@ _CENTRE = weights_within(0.5 + 0.15 * np.concatenate([[[0, 0]], _TO_SIDES, _TO_C
 _FLAT = 18  # steps from which a square has one level: 0.2 of it
 # Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.02, circles 0.13.
 _ROUNDED, _ROUNDED_PX = 0.025, 0.5
-# Greatest difference of the places of the edges along both axes: squares (0.009 in 206 rendered boards, 0.007
-# in photographs; shifted rows 0.02 and more) and px, beyond this share of the difference of the blurs' widths,
-# by which overexposed light spreads.
+# Greatest difference of the places of the edges along both axes, in squares (0.009 in 206 rendered boards,
+# 0.007 in photographs; shifted rows 0.02 and more) and in px, beyond this share of the difference of the
+# widths of the blur, by which overexposed light spreads.
 _UNEVEN, _UNEVEN_PX, _SPREAD = 0.015, 0.1, 0.3
 # Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
 # and 0.1 and more on boards with markers.
@@ -251,7 +251,7 @@ def _squares(light: Image, pixels: Array, dark: int) -> list[tuple[Array, Array]
 
 
 def _meet(quads: Array, own: Array, plain: bool) -> bool:
-    """Whether squares (N, 4, 2) of one colour have sharp corners, and `plain` ones like gaps along both axes."""
+    """Whether squares (N, 4, 2) of one colour have sharp corners, and (if `plain`) like gaps both ways."""
     shares = np.median(own, axis=0)
     axes = shares[:4].reshape(2, 2, -1).mean(axis=1)
     step = _DEPTH[1] - _DEPTH[0]

@@ -26,7 +26,13 @@ from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, 
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.saddles import grey_levels
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.markers.found import FoundBoard, SeenMarkers, agreed_markers, seen_markers
+from neurocal_cli.detection.markers.found import (
+    FoundBoard,
+    SeenMarkers,
+    agreed_markers,
+    marked_beside,
+    seen_markers,
+)
 from neurocal_cli.detection.placement import End, NoBoardError, board_ends
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import Board, Plane
@@ -38,7 +44,9 @@ Size = tuple[int, int]  # columns and rows of inner vertices, the larger number 
 _COMPLETE = 0.9  # least share of the vertices of a whole grid that were found
 _OUTER = 0.6  # least share of them in its outer lines
 _BORDER = 2.5  # squares between a grid with gaps and the image border
-_BESIDE = 1.5  # boards whose squares are smaller by more than this are behind the foremost one
+# Boards whose squares are smaller than the foremost one's by more than the first are behind it, and by more
+# than the second too far to be meant.
+_BESIDE, _FAR = 1.5, 3.0
 _ENOUGH = 0.2  # least share of the votes for the board's size, and greatest share of the grids that exceed it
 _CHANCE = 20  # vertices; smaller ones occur by chance in codes such as QR
 _CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
@@ -59,7 +67,8 @@ class SeenBoard:
 
     size: Size
     vote: Vote
-    beside: tuple[Size, ...] = ()  # whole grids next to it, not far behind
+    beside: tuple[Size, ...] = ()  # whole boards next to it
+    behind: tuple[Size, ...] = ()  # those behind it
     plain: bool = True  # whether its squares have one colour each, and no markers in them
 
 
@@ -85,11 +94,17 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
         vote = Vote.NONE if _near_border(foremost, grey.shape) else Vote.PART
     else:
         vote = Vote.SURE if states == {End.BOARD} else Vote.WHOLE
-    near = (x for x in others if _is_whole(x.seen) and x.square * _BESIDE > foremost.square)
-    beside = tuple(_ordered(x.shape) for x in near)
-    return SeenBoard(
-        _ordered(foremost.shape), vote, beside, are_plain(grey_levels(grey), foremost.pixels, foremost.dark)
-    )
+    light = grey_levels(grey)
+    whole = [
+        x
+        for x in others
+        if _is_whole(x.seen) and x.square * _FAR > foremost.square and are_plain(light, x.pixels, x.dark)
+    ]
+    near = [x.square * _BESIDE > foremost.square for x in whole]
+    beside = tuple(_ordered(x.shape) for x, one in zip(whole, near, strict=True) if one)
+    behind = tuple(_ordered(x.shape) for x, one in zip(whole, near, strict=True) if not one)
+    plain = are_plain(light, foremost.pixels, foremost.dark)
+    return SeenBoard(_ordered(foremost.shape), vote, beside, behind, plain)
 
 
 def _is_whole(seen: NDArray[np.bool_]) -> bool:
@@ -229,7 +244,7 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
         if is_certain(seen.squares) and seen.kind is seen.squares:
             break
         if len(seen.marked) in (_ENOUGH_KINDS, _MOST_MARKED) and seen.kind is seen.marked:
-            found = agreed_markers(seen.marked)
+            found = _agreed(seen)
             if found.sure or len(seen.marked) == _MOST_MARKED:
                 return found
         if sum(one.whole for one in seen.circles) >= _ENOUGH_KINDS and seen.kind is seen.circles:
@@ -248,12 +263,29 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
 
 
 def _agreed(seen: _Seen) -> FoundBoard:
+    """The board that most images show, with a word on another one beside it."""
+    squares = [{*one.beside, *one.behind} for one in (*seen.squares, *seen.patterned)]
+    others = Counter(
+        (f"a chessboard of {cols} x {rows} inner vertices", f"chessboard:{cols}x{rows}:SQUARE")
+        for each in squares
+        for cols, rows in each
+    )
     if seen.kind is seen.squares:
         size = agreed_size(seen.squares)
-        return FoundBoard(Plane("", *size.size, 1.0), size.sure)
-    return (
-        agreed_markers(seen.marked) if seen.kind is seen.marked else FoundBoard(*agreed_circles(seen.circles))
-    )
+        found = FoundBoard(Plane("", *size.size, 1.0), size.sure)
+    elif seen.kind is seen.marked:
+        found = agreed_markers(seen.marked)
+        others += marked_beside(seen.marked, found.plane)
+    else:
+        found = FoundBoard(*agreed_circles(seen.circles))
+        others += Counter(
+            other for one in seen.circles for other in {(f"a grid of {x}", x.form) for x in one.beside}
+        )
+    for (words, form), count in others.most_common(1):
+        images = f"{plural(count, 'image')} also {'shows' if count == 1 else 'show'}"
+        told = f"{images} {words}, which is not the board that is taken; give --board {form} if it is meant"
+        return replace(found, doubts=(*found.doubts, told))
+    return found
 
 
 def other_kind(images: Iterable[NDArray[np.generic]], described: Plane) -> str:

@@ -18,12 +18,12 @@ from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grey import grey_image, negative
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located, identify
-from neurocal_cli.detection.markers.locate import locate
+from neurocal_cli.detection.markers.locate import check_measured_spacing, locate
 from neurocal_cli.detection.measuring import Points, linearised, measure
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import check_kind
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.observations.board_kinds import CirclePlane
+from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 
 _FEWEST = 8  # points; fewer determine little more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge
@@ -202,7 +202,10 @@ def _measured(image: NDArray[np.generic], located: Located, points: Points, gamm
     """Measure the points of a located plane."""
     if located.circles is not None and isinstance(located.plane, CirclePlane):
         return measure_located(image, located.plane, located.circles)
-    return measure(image, located.grid, points, gamma, located.ink)
+    measured = measure(image, located.grid, points, gamma, located.ink)
+    if located.grid.paired and isinstance(located.plane, TagPlane):
+        check_measured_spacing(located.plane, located.grid, measured.polarity)
+    return measured
 
 
 def _named(located: Located, measured: Measured) -> Measured:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -99,6 +100,43 @@ def test_light_and_dark_may_be_exchanged(form: str, seed: int, psf: float) -> No
     error, _ = errors_of(detect_points(picture.image, scene.board, "vertices"), picture)
     assert len(error) == 20
     assert np.abs(error).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "kind", "told"),
+    [
+        (
+            ("circles:6x5:20:12", 26),
+            ("circles:5x4:20:12", 22),
+            "circles",
+            "1 image also shows a grid of 5 x 4 circles",
+        ),
+        (
+            ("charuco:6x5:40:30:DICT_4X4_50", 32),
+            ("aprilgrid:4x3:40:0.25", 40),
+            "charuco",
+            r"1 image also shows markers \d to \d+ of DICT_APRILTAG_36h11",
+        ),
+        (
+            ("chessboard:7x5:25", 32),
+            ("chessboard:9x6:25", 16),
+            "chessboard",
+            "1 image also shows a chessboard of 9 x 6",
+        ),
+    ],
+)
+def test_another_board_in_view_is_told(
+    first: tuple[str, float], second: tuple[str, float], kind: str, told: str
+) -> None:
+    images = [
+        taken(marked_scene(plane_of(form), 1, square=square, tilt=20.0), 1, 3).image
+        for form, square in (first, second)
+    ]
+    found, alone = found_board([np.hstack(images)]), found_board(images[:1])
+    assert kind_of(found.plane) == kind
+    assert (found.plane, alone.doubts) == (alone.plane, ())
+    (doubt,) = found.doubts
+    assert re.match(rf"{told}.*, which is not the board that is taken; give --board ", doubt)
 
 
 def test_the_unit_and_the_side_are_the_callers() -> None:
@@ -223,6 +261,18 @@ def test_things_in_rows_are_no_circles(kind: str, seed: int) -> None:
 
 def test_things_in_shifted_rows_are_no_chessboard() -> None:
     assert find_grids(no_boards.picture("windows", 186)) == []
+
+
+@pytest.mark.parametrize("gaps", [(0, 0), (6, 6), (6, 0), (6, 12), (-4, 4)])
+def test_squares_whose_gaps_differ_along_the_axes_are_no_chessboard(gaps: tuple[int, int]) -> None:
+    image = np.full((1040, 1280), 220, np.uint8)
+    for row in range(6):
+        for column in range(row % 2, 8, 2):
+            left, top = 100 + 120 * column, 100 + 120 * row
+            cv2.rectangle(image, (left, top), (left + 119 - gaps[0], top + 119 - gaps[1]), (30,), -1)
+    seen = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    found = find_grids(cv2.GaussianBlur(seen, (0, 0), 1.0))
+    assert [sorted(grid.shape) for grid in found] == ([[5, 7]] if gaps[0] == gaps[1] else [])
 
 
 @pytest.mark.parametrize("radius", [0, 6])

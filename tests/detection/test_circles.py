@@ -15,7 +15,7 @@ from support.pictures import Illumination, Rendered
 from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.circles.lattice import Blobs, largest_lattice, place_circles
+from neurocal_cli.detection.circles.lattice import Blobs, lattices, place_circles
 from neurocal_cli.detection.circles.measuring import _missed
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.placement import NoBoardError
@@ -247,7 +247,7 @@ def test_thousands_of_marks_do_not_fill_the_memory() -> None:
     blobs = Blobs(rng.uniform(0, 4000, (4000, 2)), rng.uniform(20, 60, 4000))
     tracemalloc.start()
     try:
-        largest_lattice(blobs, 3000)
+        lattices(blobs, 3000)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -198,6 +198,7 @@ def test_a_board_of_other_columns_is_refused_although_two_markers_agree(form: st
         ("arucogrid:4x3:30:0.25:DICT_6X6_50", "as if it had another number of columns"),
         ("arucogrid:6x3:30:0.25:DICT_6X6_50", "as if it had another number of columns"),
         ("arucogrid:5x3:30:0.4:DICT_6X6_50", "gap between two markers is about 0.2.*correct its spacing"),
+        ("arucogrid:5x3:30:0.3:DICT_6X6_50", "gap between two markers is about 0.25 .*correct its spacing"),
     ],
 )
 def test_markers_that_stand_alone_otherwise_than_described_are_refused(form: str, reason: str) -> None:
@@ -513,3 +514,47 @@ def test_a_stray_far_beside_a_fisheyes_board_hides_no_other_stray() -> None:
     contrast = np.ones(len(ground))
     leave_out_strays(ground, found, contrast, flattening)
     assert np.flatnonzero(np.isnan(contrast)).tolist() == [7, 20]
+
+
+_IDS = (
+    *(
+        f"charuco:{{}}x{{}}:40:{side}:DICT_{n}X{n}_{count}"
+        for n in (4, 5, 6, 7)
+        for side, count in ((30, 100), (26, 1000))
+    ),
+    "charuco:{}x{}:40:28:DICT_ARUCO_ORIGINAL",
+    *(
+        f"aprilgrid:{{}}x{{}}:40:{spacing}:{family}"
+        for spacing in (0.2, 0.3)
+        for family in ("tag36h11", "tag25h9")
+    ),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(40))
+def test_a_vertex_has_its_own_id(seed: int) -> None:
+    rng = np.random.default_rng([seed, 4412])
+    form = _IDS[seed % len(_IDS)].format(*(4 + rng.integers(2, size=2)).tolist())
+    plane = plane_of(form)
+    assert plane.markers is not None
+    first = int(rng.integers(2) * rng.integers(9))
+    plane = replace(plane, markers=replace(plane.markers, first_id=first, legacy=False))
+    shift = (float(rng.uniform(-80, 80)), float(rng.uniform(-60, 60)))
+    square = float(rng.uniform(30, 50))
+    scene = marked_scene(
+        plane,
+        seed,
+        square,
+        tilt=rng.uniform(0, 60),
+        psf=rng.uniform(0.5, 1.2),
+        k1=float(rng.choice([0.0, -0.2])),
+        shift=shift,
+    )
+    picture = taken(scene, seed, 3)
+    found = detect_points(picture.image, scene.board, "vertices")
+    places, _ = truth_of(picture)
+    off = np.hypot(*(found.pixels - np.array([places[name] for name in found.ids])).T)
+    every = np.array(list(places.values()))
+    apart = np.hypot(*(every[:, None] - every).transpose(2, 0, 1))
+    assert off.max() < 0.5 * apart[apart > 0].min()

@@ -228,7 +228,7 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     Raises NoBoardError if a part of the board is seen that may be several parts, or marks that are not round.
     """
     count = plane.cols * plane.rows
-    best = largest_lattice(blobs, count)
+    best, *_ = lattices(blobs, count)
     least = max(min(_FEWEST, count), _LEAST_SHARE * count)
     if len(best) < least:
         return None
@@ -249,26 +249,29 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     return placed
 
 
-def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
-    """The largest lattice that grows from a start, or the first of `enough` places: the blob of each."""
-    best: dict[tuple[int, int], int] = {}
-    if len(blobs) < 4:
-        return best
+def lattices(blobs: Blobs, enough: int) -> list[dict[tuple[int, int], int]]:
+    """The lattices that grow from starts, until one has `enough` places: the blob of each; the largest first.
+
+    No two have the same blobs, and there is at least one, which may be empty.
+    """
+    found: list[dict[tuple[int, int], int]] = []
     centre = blobs.centre
     # Starts far from each other: every n-th blob along the image.
     order = np.lexsort((centre[:, 0], np.round(centre[:, 1] / 50)))
     step = max(1, len(order) // _STARTS)
     tried: set[int] = set()
     for start in order[::step].tolist():
-        if start in tried:
+        if start in tried or len(blobs) < 4:
             continue
-        grown = _grown(blobs, start)
-        tried.update(grown.values())
-        if len(grown) > len(best):
-            best = grown
-        if len(best) >= enough:
+        found.append(_grown(blobs, start))
+        tried.update(found[-1].values())
+        if len(found[-1]) >= enough:
             break
-    return best
+    kept: list[dict[tuple[int, int], int]] = []
+    for one in sorted(found, key=len, reverse=True):
+        if one and not any(set(one.values()) & set(other.values()) for other in kept):
+            kept.append(one)
+    return kept or [{}]
 
 
 def _grown(blobs: Blobs, start: int) -> dict[tuple[int, int], int]:

@@ -18,7 +18,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.appearance import are_circles
-from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, largest_lattice
+from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, lattices
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -45,6 +45,12 @@ class SeenCircles:
     asymmetric: bool
     whole: bool  # whether it fills the pattern, and the image shows that it ends at all sides
     full: bool = False  # whether it fills the pattern
+    beside: tuple[SeenCircles, ...] = ()  # other whole ones in the image
+
+    @property
+    def form(self) -> str:
+        """A description in short."""
+        return f"{'asymmetric_' if self.asymmetric else ''}circles:{self.cols}x{self.rows}:DISTANCE"
 
     def __str__(self) -> str:
         """What one counts on it."""
@@ -54,17 +60,20 @@ class SeenCircles:
 def seen_circles(image: NDArray[np.generic]) -> SeenCircles | None:
     """The grid of circles that a grey image shows, dark or light; None if there is none."""
     grey = eight_bits(image)
-    lattices: list[tuple[Blobs, dict[tuple[int, int], int]]] = []
+    looks: list[tuple[Blobs, list[dict[tuple[int, int], int]]]] = []
     for light, blobs in find_blobs(grey):
-        lattices.append((blobs, largest_lattice(blobs, _MOST_CIRCLES)))
+        looks.append((blobs, lattices(blobs, _MOST_CIRCLES)))
         if light:
             # The gaps between circles are a lattice, too, of fewer places.
-            blobs, lattice = max(lattices[-2:], key=lambda one: len(one[1]))
+            blobs, (lattice, *others) = max(looks[-2:], key=lambda one: len(one[1][0]))
             seen = _seen_in(grey, blobs, lattice)
             areas = blobs.area[list(lattice.values())]
             if seen is not None and seen.whole and areas.min() > _LARGE * grey.size:
                 break
-    return seen
+    if seen is None:
+        return None
+    beside = (_seen_in(grey, blobs, one) for one in others)
+    return replace(seen, beside=tuple(_pattern(one) for one in beside if one is not None and one.whole))
 
 
 def _seen_in(
@@ -154,4 +163,4 @@ def agreed_circles(seen: Sequence[SeenCircles]) -> tuple[CirclePlane, bool]:
 
 
 def _pattern(seen: SeenCircles) -> SeenCircles:
-    return replace(seen, whole=False, full=False)
+    return replace(seen, whole=False, full=False, beside=())

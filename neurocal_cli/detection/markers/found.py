@@ -22,7 +22,7 @@ from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
 from neurocal_cli.detection.grey import eight_bits, negative
 from neurocal_cli.detection.markers.lattice import find_vertices, place
-from neurocal_cli.detection.markers.locate import smallest
+from neurocal_cli.detection.markers.locate import codes_alike, smallest
 from neurocal_cli.detection.markers.numbering import (
     UNIT,
     Layout,
@@ -64,6 +64,7 @@ class SeenMarkers:
 
     image: NDArray[np.generic]
     lie: Lie
+    every: Marks  # also those that are in no lattice, or in another one
     border: int  # [cells]
     inverted: bool  # whether the image is the negative, in which they were read
 
@@ -91,7 +92,7 @@ def seen_markers(image: NDArray[np.generic]) -> tuple[SeenMarkers, ...]:
             # On ChArUco boards, OpenCV prints borders of one cell.
             if lie is not None and len(lie.marks) >= _FEWEST and (lie.tags or border == 1):
                 picture = negative(image) if inverted else image
-                found.append(SeenMarkers(picture, lie, border, bool(inverted)))
+                found.append(SeenMarkers(picture, lie, marks, border, bool(inverted)))
         if found:
             return tuple(sorted(found, key=lambda one: -len(one.lie.marks)))
     return ()
@@ -115,6 +116,32 @@ def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundBoard:
         f"the numbers of the markers of {dictionary} do not tell a board; show more of it, or describe it by "
         "--board, for example charuco:8x6:28:21"
     )
+
+
+def marked_beside(images: Sequence[tuple[SeenMarkers, ...]], plane: Plane) -> Counter[tuple[str, str]]:
+    """How many images show markers of another board beside that of a plane: what they show, and a short form.
+
+    They are of another dictionary or have other numbers, and lie and grow as those of a board do.
+    """
+    assert plane.markers is not None
+    own = marked_cells(plane, next(prints(plane))).number
+    seen: Counter[tuple[str, str]] = Counter()
+    for each in images:
+        mine = [one for one in each if codes_alike(one.every.dictionary, plane.markers.dictionary)]
+        known = [one.every.corners[np.isin(one.every.number, own)] for one in mine]
+        taken = np.concatenate([*known, np.zeros((0, 4, 2))])
+        for one in each:
+            marks = one.every
+            away = np.abs(marks.corners.mean(axis=1)[:, None] - taken.mean(axis=1)).max(axis=2)
+            side = np.abs(marks.corners - marks.corners.mean(axis=1, keepdims=True)).max(axis=(1, 2))
+            free = away.min(axis=1, initial=np.inf) > side
+            lie = lie_of(marks.only(free & ~np.isin(marks.number, own) if one in mine else free))
+            if lie is not None and numbered([lie]) is not None:
+                numbers = f"{lie.marks.number.min()} to {lie.marks.number.max()}"
+                form = "aprilgrid:COLSxROWS:TAG:SPACING" if lie.tags else "charuco:COLSxROWS:SQUARE:MARKER"
+                seen[f"markers {numbers} of {marks.dictionary}", form] += 1
+                break
+    return seen
 
 
 def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> FoundBoard:

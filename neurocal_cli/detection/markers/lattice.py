@@ -75,7 +75,8 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
         if len(kept) < 2:
             continue
         if best is None or len(kept) > len(best.at):
-            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], len(at))
+            # Of a blurred marker, two outlines may be read.
+            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], len(np.unique(at)))
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
     return best

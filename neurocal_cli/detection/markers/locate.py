@@ -41,6 +41,11 @@ _PLACED = 0.5  # least share of the markers that were read that are where the bo
 # Distance of markers as read over the described one: 0.97 to 1.06 (once 1.17) in 60 views, as the sides of
 # markers are read too small.
 _SPACED = 0.95, 1.2
+# Greatest shift of measured edges, towards the light and towards the dark [px], and by ink [sides]. It is at
+# most 0.01 px in rendered views, and 0.2 to 0.4 px towards the dark with gamma 2.2 and a blur of 0.5 to 1.2
+# px; spacings of 0.2 and 0.25 differ by 0.02 sides.
+_DARKENED, _LIGHTENED, _PRINTED = 0.1, 0.8, 0.006
+_OF_TAGS = np.s_[::2], np.s_[:, ::2]  # of the steps down and along the corners of tags, those of their sides
 _STRANGE = 8  # markers of another dictionary that are worth a word
 _MIRRORED = ((1, 0), (0, -1))
 
@@ -69,7 +74,7 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
                 "legacy: true or false in a board file"
             )
         one = _located(plane, index, placed, *found)
-        few = len(placed.at) < _PLACED * placed.read
+        few = len(np.unique(placed.at)) < _PLACED * placed.read
         if few or not _shows_its_codes(one, placed.marks.dictionary, light):
             raise NoBoardError(
                 "most markers are not where the board has them, as if it had another number of columns; "
@@ -86,10 +91,25 @@ def _check_spacing(plane: TagPlane, marks: Marks) -> None:
     """Refuse markers that stand alone and are farther from each other, or nearer, than the board has them."""
     lie = lie_of(marks)
     if lie is not None and not _SPACED[0] < lie.step / (1 + plane.spacing) < _SPACED[1]:
-        raise NoBoardError(
-            f"the gap between two markers is about {lie.step - 1:.2f} of their side, and the board has "
-            f"{plane.spacing:g}; correct its spacing"
-        )
+        raise _other_spacing(plane, lie.step)
+
+
+def check_measured_spacing(plane: TagPlane, grid: Grid, polarity: float) -> None:
+    """Refuse markers that stand alone if their edges are off by more than ink, light and response move them.
+
+    `polarity` [px] is how far the light has grown at the edges between light and dark.
+    """
+    sides = np.concatenate([np.diff(grid.pixels, axis=k)[at].reshape(-1, 2) for k, at in enumerate(_OF_TAGS)])
+    side = float(np.nanmedian(np.hypot(*sides.T)))
+    if not -_DARKENED - _PRINTED * side < polarity < _LIGHTENED + _PRINTED * side:
+        raise _other_spacing(plane, (1 + plane.spacing) * side / (side - 2 * polarity))
+
+
+def _other_spacing(plane: TagPlane, step: float) -> NoBoardError:
+    return NoBoardError(
+        f"the gap between two markers is about {step - 1:.2f} of their side, and the board has "
+        f"{plane.spacing:g}; correct its spacing"
+    )
 
 
 def _vertices(plane: Plane, placed: Placed, light: Image) -> tuple[Grid, tuple[int, int]] | None:
@@ -212,16 +232,16 @@ def _reason(board: Board, grey: NDArray[np.uint8], read: int, quadrangles: Seque
     named = {plane.markers.dictionary for plane in board.planes if plane.markers is not None} - {""}
     tags = next((plane for plane in board.planes if isinstance(plane, TagPlane)), None)
     seen = list(_codes(grey, quadrangles)) if named else []
-    own = [one for one in seen if any(_codes_alike(one[0].dictionary, name) for name in named)]
+    own = [one for one in seen if any(codes_alike(one[0].dictionary, name) for name in named)]
     if tags is not None and any(len(marks) >= _ENOUGH for marks, _ in own):
         # The quadrangles are those of tags with the border that is described.
-        own += [one for one in read_codes(grey)[0] if _codes_alike(one[0].dictionary, own[0][0].dictionary)]
+        own += [one for one in read_codes(grey)[0] if codes_alike(one[0].dictionary, own[0][0].dictionary)]
         for marks, border in own:
             if border != tags.border and len(marks) >= _ENOUGH:
                 cells = "a border of one cell" if border == 1 else "a border of two cells"
                 return f"the tags have {cells}; say border: {border} in a board file"
     for marks, _ in seen:
-        if not any(_codes_alike(marks.dictionary, one) for one in named) and len(marks) >= _STRANGE:
+        if not any(codes_alike(marks.dictionary, one) for one in named) and len(marks) >= _STRANGE:
             return (
                 f"the image shows markers of {marks.dictionary} instead of {' and '.join(sorted(named))}; "
                 "correct the dictionary of the board"
@@ -232,7 +252,7 @@ def _reason(board: Board, grey: NDArray[np.uint8], read: int, quadrangles: Seque
     )
 
 
-def _codes_alike(one: str, other: str) -> bool:
+def codes_alike(one: str, other: str) -> bool:
     """Whether a dictionary begins with the codes of another."""
     bits, _, count = one.rpartition("_")
     return one == other or (count.isdigit() and other.rpartition("_")[0] == bits)
