@@ -45,7 +45,6 @@ _SPACED = 0.95, 1.2
 # most 0.01 px in rendered views, and 0.2 to 0.4 px towards the dark with gamma 2.2 and a blur of 0.5 to 1.2
 # px; spacings of 0.2 and 0.25 differ by 0.02 sides.
 _DARKENED, _LIGHTENED, _PRINTED = 0.1, 0.8, 0.006
-_OF_TAGS = np.s_[::2], np.s_[:, ::2]  # of the steps down and along the corners of tags, those of their sides
 _STRANGE = 8  # markers of another dictionary that are worth a word
 _MIRRORED = ((1, 0), (0, -1))
 
@@ -99,7 +98,8 @@ def check_measured_spacing(plane: TagPlane, grid: Grid, polarity: float) -> None
 
     `polarity` [px] is how far the light has grown at the edges between light and dark.
     """
-    sides = np.concatenate([np.diff(grid.pixels, axis=k)[at].reshape(-1, 2) for k, at in enumerate(_OF_TAGS)])
+    along, down = np.diff(grid.pixels, axis=1)[:, ::2], np.diff(grid.pixels, axis=0)[::2]
+    sides = np.concatenate([along.reshape(-1, 2), down.reshape(-1, 2)])
     side = float(np.nanmedian(np.hypot(*sides.T)))
     if not -_DARKENED - _PRINTED * side < polarity < _LIGHTENED + _PRINTED * side:
         raise _other_spacing(plane, (1 + plane.spacing) * side / (side - 2 * polarity))
