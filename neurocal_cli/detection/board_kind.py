@@ -72,14 +72,6 @@ class SeenBoard:
     plain: bool = True  # whether its squares have one colour each, and no markers in them
 
 
-@frozen_dataclass
-class FoundSize:
-    """The size of a board that images agree on."""
-
-    size: Size
-    sure: bool  # whether an image shows all its ends
-
-
 def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
     """The foremost chessboard of a grey image; None if there is none."""
     grids = find_grids(grey)
@@ -137,8 +129,8 @@ def is_certain(seen: Sequence[SeenBoard]) -> bool:
     return count >= needed and 2 * count > len(seen) and all(_holds(size, one.size) for one in seen)
 
 
-def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
-    """The size of the board that at least one image shows; see `board_kind`."""
+def agreed_size(seen: Sequence[SeenBoard]) -> FoundBoard:
+    """The chessboard that at least one image shows; see `board_kind`."""
     several = [one for one in seen if one.beside]
     if 2 * len(several) > len(seen):
         sizes, _ = Counter(tuple(sorted((one.size, *one.beside))) for one in several).most_common(1)[0]
@@ -163,7 +155,7 @@ def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
     if sure and not sure[best]:
         # A smaller one whose ends are seen is no part of a larger one, which may have a false line.
         best = max(enough, key=lambda size: (sure[size], enough[size]))
-    return FoundSize(best, sure[best] > 0)
+    return FoundBoard(Plane("", *best, 1.0), sure[best] > 0)
 
 
 def _with_enough_votes(seen: Sequence[SeenBoard], least: Vote) -> dict[Size, int]:
@@ -271,8 +263,7 @@ def _agreed(seen: _Seen) -> FoundBoard:
         for cols, rows in each
     )
     if seen.kind is seen.squares:
-        size = agreed_size(seen.squares)
-        found = FoundBoard(Plane("", *size.size, 1.0), size.sure)
+        found = agreed_size(seen.squares)
     elif seen.kind is seen.marked:
         found = agreed_markers(seen.marked)
         others += marked_beside(seen.marked, found.plane)
