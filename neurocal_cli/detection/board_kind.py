@@ -257,11 +257,7 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
 def _agreed(seen: _Seen) -> FoundBoard:
     """The board that most images show, with a word on another one beside it."""
     squares = [{*one.beside, *one.behind} for one in (*seen.squares, *seen.patterned)]
-    others = Counter(
-        (f"a chessboard of {cols} x {rows} inner vertices", f"chessboard:{cols}x{rows}:SQUARE")
-        for each in squares
-        for cols, rows in each
-    )
+    others = Counter(f"a chessboard of {c} x {r} inner vertices" for each in squares for c, r in each)
     if seen.kind is seen.squares:
         found = agreed_size(seen.squares)
     elif seen.kind is seen.marked:
@@ -269,12 +265,12 @@ def _agreed(seen: _Seen) -> FoundBoard:
         others += marked_beside(seen.marked, found.plane)
     else:
         found = FoundBoard(*agreed_circles(seen.circles))
-        others += Counter(
-            other for one in seen.circles for other in {(f"a grid of {x}", x.form) for x in one.beside}
-        )
-    for (words, form), count in others.most_common(1):
+        others += Counter(f"a grid of {other}" for one in seen.circles for other in set(one.beside))
+    for words, count in others.most_common(1):
         images = f"{plural(count, 'image')} also {'shows' if count == 1 else 'show'}"
-        told = f"{images} {words}, which is not the board that is taken; give --board {form} if it is meant"
+        told = (
+            f"{images} {words}, which is not the board that is taken; describe it by --board if you mean it"
+        )
         return replace(found, doubts=(*found.doubts, told))
     return found
 

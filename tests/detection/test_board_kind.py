@@ -136,7 +136,7 @@ def test_another_board_in_view_is_told(
     assert kind_of(found.plane) == kind
     assert (found.plane, alone.doubts) == (alone.plane, ())
     (doubt,) = found.doubts
-    assert re.match(rf"{told}.*, which is not the board that is taken; give --board ", doubt)
+    assert re.match(rf"{told}.*, which is not the board that is taken; describe it by --board", doubt)
 
 
 def test_the_unit_and_the_side_are_the_callers() -> None:

@@ -47,11 +47,6 @@ class SeenCircles:
     full: bool = False  # whether it fills the pattern
     beside: tuple[SeenCircles, ...] = ()  # other whole ones in the image
 
-    @property
-    def form(self) -> str:
-        """A description in short."""
-        return f"{'asymmetric_' if self.asymmetric else ''}circles:{self.cols}x{self.rows}:DISTANCE"
-
     def __str__(self) -> str:
         """What one counts on it."""
         return f"{self.cols} x {self.rows}{' asymmetric' if self.asymmetric else ''} circles"

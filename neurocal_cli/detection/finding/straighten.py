@@ -108,12 +108,8 @@ def _groups(links: Links) -> Iterator[tuple[Index, Index]]:
 
 def _most_shared(lattices: list[Lattice], pixels: Array) -> int:
     """Greatest number of vertices that a lattice has among pixels (N, 2)."""
-    counts = [0]
-    for lattice in lattices:
-        own = lattice.pixels[lattice.seen]
-        away = np.hypot(*np.moveaxis(own[:, None] - pixels, -1, 0)).min(axis=1)
-        counts.append(int((away < 0.25 * lattice.width).sum()))
-    return max(counts)
+    shared = (distance(x.pixels[x.seen], pixels) < 0.25 * x.width for x in lattices)
+    return max((int(near.sum()) for near in shared), default=0)
 
 
 def _fitted(places: Array, pixels: Array, level: Level) -> WideFit | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,29 +118,20 @@ def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundBoard:
     )
 
 
-def marked_beside(images: Sequence[tuple[SeenMarkers, ...]], plane: Plane) -> Counter[tuple[str, str]]:
-    """How many images show markers of another board beside that of a plane: what they show, and a short form.
+def marked_beside(images: Sequence[tuple[SeenMarkers, ...]], plane: Plane) -> Counter[str]:
+    """How many images show markers of another board than that of a plane, and which.
 
     They are of another dictionary or have other numbers, and lie and grow as those of a board do.
     """
     assert plane.markers is not None
     own = marked_cells(plane, next(prints(plane))).number
-    seen: Counter[tuple[str, str]] = Counter()
-    for each in images:
-        mine = [one for one in each if codes_alike(one.every.dictionary, plane.markers.dictionary)]
-        known = [one.every.corners[np.isin(one.every.number, own)] for one in mine]
-        taken = np.concatenate([*known, np.zeros((0, 4, 2))])
-        for one in each:
-            marks = one.every
-            away = np.abs(marks.corners.mean(axis=1)[:, None] - taken.mean(axis=1)).max(axis=2)
-            side = np.abs(marks.corners - marks.corners.mean(axis=1, keepdims=True)).max(axis=(1, 2))
-            free = away.min(axis=1, initial=np.inf) > side
-            lie = lie_of(marks.only(free & ~np.isin(marks.number, own) if one in mine else free))
-            if lie is not None and numbered([lie]) is not None:
-                numbers = f"{lie.marks.number.min()} to {lie.marks.number.max()}"
-                form = "aprilgrid:COLSxROWS:TAG:SPACING" if lie.tags else "charuco:COLSxROWS:SQUARE:MARKER"
-                seen[f"markers {numbers} of {marks.dictionary}", form] += 1
-                break
+    seen: Counter[str] = Counter()
+    for one in chain.from_iterable(images):
+        alike = codes_alike(one.every.dictionary, plane.markers.dictionary)
+        lie = lie_of(one.every.only(~np.isin(one.every.number, own))) if alike else one.lie
+        if lie is not None and numbered([lie]) is not None:
+            number = lie.marks.number
+            seen[f"markers {number.min()} to {number.max()} of {lie.marks.dictionary}"] += 1
     return seen
 
 
