@@ -54,8 +54,8 @@ _MIXED = (
     0.015,
     0.1,
 )  # rms, of the light by the distance from that of a disc or a ring (0.012; photographs 0.027)
-_LONG = 0.08, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
-_CORNERED = 0.012, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
+_LONG = 0.04, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
+_CORNERED = 0.009, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
 _SIGNED = (
     0.09,
     0.09,
