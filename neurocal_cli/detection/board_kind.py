@@ -33,7 +33,7 @@ from neurocal_cli.detection.markers.found import (
     marked_beside,
     seen_markers,
 )
-from neurocal_cli.detection.placement import End, NoBoardError, board_ends
+from neurocal_cli.detection.placement import End, NoBoardError, board_ends, fits, size_names
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import found_words
@@ -114,10 +114,6 @@ def _ordered(shape: Size) -> Size:
     return max(shape), min(shape)
 
 
-def _holds(large: Size, small: Size) -> bool:
-    return large[0] >= small[0] and large[1] >= small[1]
-
-
 def is_certain(seen: Sequence[SeenBoard]) -> bool:
     """Whether further images need not be examined: there are enough votes, and all grids are parts of it."""
     votes = Counter(one.size for one in seen if one.vote >= Vote.WHOLE and not one.beside)
@@ -126,7 +122,7 @@ def is_certain(seen: Sequence[SeenBoard]) -> bool:
     size, count = votes.most_common(1)[0]
     sure = any(one.vote == Vote.SURE for one in seen if one.size == size)
     needed = _CERTAIN if sure else _CERTAIN_UNSURE
-    return count >= needed and 2 * count > len(seen) and all(_holds(size, one.size) for one in seen)
+    return count >= needed and 2 * count > len(seen) and all(fits(one.size, size) for one in seen)
 
 
 def agreed_size(seen: Sequence[SeenBoard]) -> FoundBoard:
@@ -135,21 +131,21 @@ def agreed_size(seen: Sequence[SeenBoard]) -> FoundBoard:
     if 2 * len(several) > len(seen):
         sizes, _ = Counter(tuple(sorted((one.size, *one.beside))) for one in several).most_common(1)[0]
         raise NoBoardError(
-            f"the images show {len(sizes)} chessboards beside each other, of {_names(sizes)} inner vertices; "
-            "describe them in a board file and give it with --board, or show only one of them"
+            f"the images show {len(sizes)} chessboards beside each other, of {size_names(sizes)} inner "
+            "vertices; describe them in a board file and give it with --board, or show only one of them"
         )
     sure = Counter(one.size for one in seen if one.vote == Vote.SURE)
     enough = _with_enough_votes(seen, Vote.WHOLE) or _with_enough_votes(seen, Vote.PART)
     best = max(enough, key=lambda size: (size[0] * size[1], size), default=(0, 0))
-    if other := next((size for size in enough if not _holds(best, size)), None):
+    if other := next((size for size in enough if not fits(size, best)), None):
         raise NoBoardError(
-            f"the images show boards of different sizes, {_names((best, other))} inner vertices; give the "
-            "size of yours by --cols and --rows"
+            f"the images show boards of different sizes, {size_names((best, other))} inner vertices; give "
+            "the size of yours by --cols and --rows"
         )
-    if sum(not _holds(best, one.size) for one in seen) > _ENOUGH * len(seen):
+    if sum(not fits(one.size, best) for one in seen) > _ENOUGH * len(seen):
         parts = [size for size, _ in Counter(one.size for one in seen).most_common(3)]
         raise NoBoardError(
-            f"only parts of a chessboard are seen, of {_names(parts)} inner vertices in "
+            f"only parts of a chessboard are seen, of {size_names(parts)} inner vertices in "
             f"{plural(len(seen), 'image')}; give its size by --cols and --rows, or show it whole"
         )
     if sure and not sure[best]:
@@ -172,11 +168,6 @@ def _with_enough_votes(seen: Sequence[SeenBoard], least: Vote) -> dict[Size, int
         if count >= _ENOUGH * votes.total()
         and (size in sure or ((count > 1 or alone) and size[0] * size[1] >= _CHANCE))
     }
-
-
-def _names(sizes: Iterable[Size]) -> str:
-    *names, last = (f"{cols} x {rows}" for cols, rows in sizes)
-    return f"{', '.join(names)} and {last}" if names else last
 
 
 _MOST_TRIED = 5  # images without a chessboard, markers and circles that are searched for all of these

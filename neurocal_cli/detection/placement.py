@@ -15,7 +15,7 @@ A grid that cannot be placed gives a `NoBoardError`, whose message says what the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from itertools import product
 
@@ -309,13 +309,11 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
     """
     left = grid
     few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
-    sizes = [sorted((plane.cols, plane.rows)) for plane in planes]
     while True:
-        short, long = sorted(left.shape)
-        if any(short <= narrow and long <= wide for narrow, wide in sizes):
+        if any(fits(left.shape, (plane.cols, plane.rows)) for plane in planes):
             return left
         shares = [float(left.seen[side].mean()) for side in _SIDES]
-        if min(shares) > few or short <= 3:
+        if min(shares) > few or min(left.shape) <= 3:
             return grid
         pixels = left.pixels.copy()
         pixels[_SIDES[shares.index(min(shares))]] = np.nan
@@ -348,15 +346,15 @@ def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) ->
             )
     if grid.seen.mean() < _WHOLE:
         return NoBoardError(
-            f"detected no board of {wanted} inner vertices, only parts of a pattern of {_size(shape)}; "
-            "show the whole board, sharp and evenly lit",
+            f"detected no board of {wanted} inner vertices, only parts of a pattern of {size_names([shape])}"
+            "; show the whole board, sharp and evenly lit",
             shape,
         )
-    may_be_a_part = len(board.planes) == 1 and _fits(shape, board.planes[0])
+    may_be_a_part = len(board.planes) == 1 and fits(shape, (board.planes[0].cols, board.planes[0].rows))
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
     return NoBoardError(
-        f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "
-        f"image{', or show all of it' if may_be_a_part else ''}",
+        f"detected {size_names([shape])} inner vertices, but the {have} {wanted}; give the size of the board "
+        f"in the image{', or show all of it' if may_be_a_part else ''}",
         shape,
     )
 
@@ -368,7 +366,7 @@ def ambiguous(board: Board, grids: Sequence[Grid], rms: float) -> NoBoardError:
     if part is not None:
         shape = _in_order(part.shape, board)
         return NoBoardError(
-            f"detected {_size(shape)} of {_sizes(board)} inner vertices, but it is ambiguous "
+            f"detected {size_names([shape])} of {_sizes(board)} inner vertices, but it is ambiguous "
             "which ones; show its outer border on more sides, or correct the size if this is all of it",
             shape,
         )
@@ -383,9 +381,9 @@ def ambiguous(board: Board, grids: Sequence[Grid], rms: float) -> NoBoardError:
     )
 
 
-def _fits(shape: tuple[int, int], plane: Plane) -> bool:
-    """Whether a grid of this shape may be a part of the plane."""
-    (short, long), (narrow, wide) = sorted(shape), sorted((plane.cols, plane.rows))
+def fits(shape: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether a grid of this shape may be a part of a board of a size."""
+    (short, long), (narrow, wide) = sorted(shape), sorted(size)
     return short <= narrow and long <= wide
 
 
@@ -397,9 +395,10 @@ def _in_order(shape: tuple[int, int], board: Board) -> tuple[int, int]:
 
 
 def _sizes(board: Board) -> str:
-    names = [_size((plane.cols, plane.rows)) for plane in board.planes]
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    return size_names((plane.cols, plane.rows) for plane in board.planes)
 
 
-def _size(shape: tuple[int, int]) -> str:
-    return f"{shape[0]} x {shape[1]}"
+def size_names(sizes: Iterable[tuple[int, int]]) -> str:
+    """Columns and rows of boards, such as 9 x 6 and 8 x 6."""
+    *names, last = (f"{cols} x {rows}" for cols, rows in sizes)
+    return f"{', '.join(names)} and {last}" if names else last
