@@ -108,21 +108,25 @@ def moving(seen: Seen) -> Array | None:
 
 
 def pose(seen: Seen) -> Array:
-    """The pose of the view is another one: its rotation, and its shift over the size of the target."""
-    return seen.by_pose
+    """The pose of the view is another one."""
+    return _motion(seen, seen.by_pose[:, :3])
 
 
 def moved_camera(seen: Seen) -> Array:
     """The camera is elsewhere by one motion in its own frame, as if a hand-eye calibration were wrong."""
-    by_tau, size = seen.by_pose[:, 3:], seen.size[:, None, None, None]
-    turned = seen.by_pose[:, :3] + np.cross(seen.origin[:, :, None, None], by_tau, axis=1)
-    return np.concatenate([turned, by_tau / size], axis=1)
+    origin = seen.origin[:, :, None, None]
+    return _motion(seen, seen.by_pose[:, :3] + np.cross(origin, seen.by_pose[:, 3:], axis=1))
+
+
+def _motion(seen: Seen, turned: Array) -> Array:
+    """A rotation, and a shift over the size of the target."""
+    return np.concatenate([turned, seen.by_pose[:, 3:] / seen.size[:, None, None, None]], axis=1)
 
 
 def moved_target(seen: Seen) -> Array:
     """The target is elsewhere by one motion in its own frame."""
     turned = np.cross(np.moveaxis(seen.at, 0, 1)[:, :, None], seen.by_target, axis=1)
-    return np.concatenate([turned, seen.by_target], axis=1)
+    return np.concatenate([turned, seen.by_target / seen.half], axis=1)
 
 
 def cut(axis: int) -> Effect:

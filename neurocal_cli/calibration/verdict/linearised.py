@@ -78,6 +78,7 @@ class Seen:
     by_pose: Array  # (T, 6, 2, n) derivatives by the poses of the views
     origin: Array  # (T, 3) the middle of the target from the camera, over its size in this view
     size: Array  # (T,) this, over that of all views
+    half: float  # the half length of the target, over the same
     # Derivatives (T, 3, 2, n) along the axes of the target, over its half length: along a board, across it
     # and along its normal, else along those of the world; the places (3, T, n), over the same; and the
     # directions (T, 3, n) to the camera along these axes.
@@ -210,7 +211,8 @@ def _derivatives(
         from_centre, focal = observed - off - state.entries[0, 3:, None], state.entries[0, [0, 2]]
         seen = Seen(
             J[:, :5], observed - off - middle[:, None], px, by_pose[:, 5] / scale, from_centre, focal,
-            by_pose, tau, views.scale[view] / views.scale.mean(), by_target, at, to_camera, board.flat,
+            by_pose, tau, views.scale[view] / views.scale.mean(), board.size / views.scale.mean(),
+            by_target, at, to_camera, board.flat,
         )  # fmt: skip
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}
         widths = {effect: part.shape[1] for effect, part in found.items()}

@@ -154,39 +154,19 @@ def odd_view(told: Told) -> Said:
     )
 
 
-def wrong_poses(told: Told) -> Said:
-    """Given poses that are wrong in each view."""
-    scale = told.lin.views.scale[:, None]
-    return _off("the given poses are wrong, each in its own way", told, told.found.amounts, scale)
-
-
-def wrong_pose(told: Told) -> Said:
-    """One given pose that is wrong."""
-    scale = told.lin.views.scale[told.found.weights > 0]
-    return _off(f"{told.members[0]}: the given pose is wrong", told, told.found.amounts[None], scale)
-
-
-def moved(what: str, how: str) -> Say:
-    """Given poses that are wrong by one motion."""
+def wrong_poses(how: str) -> Say:
+    """Given poses that are wrong, by how much (rms)."""
 
     def say(told: Told) -> Said:
-        lin = told.lin
-        scale = np.array([lin.views.scale.mean() if what == "camera" else lin.board.size])
-        all_off = f"all given poses are wrong by one motion of the {what}, {how}"
-        return _off(all_off, told, told.found.amounts[None], scale)
+        turn, shift = np.sqrt((told.found.amounts.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0)).tolist()
+        which = f"{told.members[0]}: " if told.found.pattern == "one" else ""
+        return (
+            f"{which}{how}, by {shift * told.lin.views.scale.mean():.2g} {told.unit} and "
+            f"{np.degrees(turn):.2g} degrees",
+            told.displaced / told.diagonal,
+        )
 
     return say
-
-
-def _off(reason: str, told: Told, amounts: Array, scale: Array) -> Said:
-    """By how much (rms) poses are off whose amounts (V, 6) are rotations, and shifts over a scale."""
-    turn, shift = (
-        float(np.sqrt((one**2).sum(axis=1).mean())) for one in (amounts[:, :3], amounts[:, 3:] * scale)
-    )
-    return (
-        f"{reason}, by {shift:.2g} {told.unit} and {np.degrees(turn):.2g} degrees",
-        told.displaced / told.diagonal,
-    )
 
 
 def bent(told: Told) -> Said:
