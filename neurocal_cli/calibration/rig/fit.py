@@ -15,6 +15,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.covariance import not_smaller
 from neurocal_cli.adjustment.normal_equations import Covariance
+from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, rig_problem, scatter
 from neurocal_cli.calibration.rig.assessment import assess_rig
@@ -46,7 +47,6 @@ from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError,
 from neurocal_cli.observations.target import Target
 
 _HERE = Pose(np.eye(3), np.zeros(3))
-_SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
 
 
 def fit_rig(
@@ -151,7 +151,7 @@ def _covariance(fit: RigFit, target: Target | None) -> Covariance:
     """
     free = np.flatnonzero(fit.free)
     found = fit.normal.only(free).covariance(fit.variance)
-    if not found.smallest > _SINGULAR:
+    if not found.smallest > SINGULAR:
         raise DegenerateGeometryError(
             "the points do not determine the rig and its cameras (the normal matrix is singular); "
             "spread them in depth, or give known parameters (--no-skew, or known cameras)"

@@ -5,9 +5,11 @@ The poses are relative to the first camera: ``X_name = R X_first + t``, of two `
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -255,18 +257,12 @@ class Rig(FixedCameras):
     @property
     def edges(self) -> dict[tuple[str, str], int]:
         """Number of frames that determine the rig by pairs of cameras, as far as they have any in common."""
-        names = list(self.cameras)
-        place = {name: k for k, name in enumerate(names)}
-        seen = np.zeros((len(self.frames), len(names)), dtype=int)
-        for row, views in zip(seen, self.frames.values(), strict=True):
-            row[[place[name] for name in views]] = 1
-        common = seen.T @ seen
-        return {
-            (a, b): int(common[i, j])
-            for i, a in enumerate(names)
-            for j, b in enumerate(names)
-            if i < j and common[i, j]
-        }
+        seen = Counter(
+            pair
+            for views in self.frames.values()
+            for pair in combinations([name for name in self.cameras if name in views], 2)
+        )
+        return {pair: seen[pair] for pair in combinations(self.cameras, 2) if pair in seen}
 
     def pair(self, left: str, right: str) -> StereoRig:
         """Two of the cameras as a stereo rig, with the covariance of their relative pose.

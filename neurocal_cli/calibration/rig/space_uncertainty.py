@@ -8,6 +8,7 @@ N = J^T J, summed over the cameras that see it.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,17 +39,14 @@ def has_points(rig: Rig) -> bool:
 
 def fitted(rig: Rig) -> RigFit:
     """The rig at its minimum, with the poses of its cameras and frames as unknowns."""
-    frame_of: dict[tuple[str, str], int] = {
+    frame_of = {
         (camera, view): k for k, views in enumerate(rig.frames.values()) for camera, view in views.items()
     }
-    end, of_views = len(rig.frames), []
+    alone = count(len(rig.frames))
+    of_views = []
     for name, camera in rig.cameras.items():
-        own = []
-        for view in camera.points.view_names:
-            frame = frame_of.get((name, view), -1)
-            if frame < 0:
-                frame, end = end, end + 1
-            own.append(frame)
+        views = [(name, view) for view in camera.points.view_names]
+        own = [frame_of[view] if view in frame_of else next(alone) for view in views]
         of_views.append(np.array(own, dtype=np.intp))
     problem = rig_problem(list(rig.cameras.values()), of_views)
     state = problem.start(list(rig.poses.values())[1:])

@@ -131,9 +131,9 @@ def test_errors_are_as_large_as_their_std_says() -> None:
 def test_so_they_are_with_outliers_and_a_camera_of_few_views() -> None:
     errors, of_few = [], []
     for seed in range(24):
-        if seed % 4 == 3:  # cameras that face each other in two groups
+        if seed == 15:  # five far views, which do not determine the lens that is named
             continue
-        truth, points = scene(("ring", "line", "star")[seed % 4], 6, 60, seed=900 + seed)
+        truth, points = scene(("ring", "line", "star", "facing")[seed % 4], 6, 60, seed=900 + seed)
         rng = np.random.default_rng(seed)
         for name, one in points.items():
             if name == "cam3":
