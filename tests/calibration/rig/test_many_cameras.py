@@ -195,7 +195,7 @@ def test_two_fisheyes_back_to_back_share_what_is_beside_both() -> None:
         R = np.column_stack([x, np.cross(z, x), z])
         frames[f"{k:03d}"] = Pose(R, 350.0 * towards / np.linalg.norm(towards) - R @ board.mean(axis=0))
     truth = SimulatedRig({"left": camera, "right": camera}, mounted, board, frames)
-    pair = calibrate_stereo(*truth.points(0.2, rng).values(), skew=False, distortion="fisheye")
+    pair = calibrate_stereo(*truth.points(0.2, rng).values(), skew=False)
     assert np.abs(errors_over_std(of_two(pair), truth)).max() < 4.5
     assert pair.verdict is not None
     assert pair.verdict.word == "good"
