@@ -154,13 +154,22 @@ class Target:
         )
 
     def bend(self) -> float:
-        """Height between the highest and lowest point over the mean plane, of the worst plane [world]."""
+        """Difference between the greatest and least height over where a point was given, of the worst plane.
+
+        It is in the world unit, and without a tilt of the plane.
+        """
         worst = 0.0
-        for found, _ in self._planes():
+        for found, given in self._planes():
             rows = np.column_stack([np.ones(len(found)), found[:, :2]])
-            height = found[:, 2] - rows @ np.linalg.lstsq(rows, found[:, 2], rcond=None)[0]
-            worst = max(worst, float(np.ptp(height)))
+            height = found[:, 2] - given[:, 2]
+            worst = max(worst, float(np.ptp(height - rows @ np.linalg.lstsq(rows, height, rcond=None)[0])))
         return worst
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether the points were given as those of planes, and not in space."""
+        given = [given for _, given in self._planes()]
+        return all((one[:, 2] ** 2).mean() <= MISPRINT**2 * (one**2).mean() for one in given)
 
     def stretch(self) -> float:
         """Anisotropic stretch of the worst plane: ratio of its two principal scales, minus 1."""

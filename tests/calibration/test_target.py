@@ -22,6 +22,7 @@ from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.calibration.target_choice import on_one_target
+from neurocal_cli.commands.show.camera_report import target_lines
 from neurocal_cli.errors import FormatError, InputError, UsageError
 from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
@@ -29,7 +30,7 @@ from neurocal_cli.files.points_csv import read_points
 from neurocal_cli.files.result_files import write_calibration
 from neurocal_cli.files.rig_yaml import read_stereo_rig
 from neurocal_cli.observations.board import Plane, planes_of
-from neurocal_cli.observations.target import board_of
+from neurocal_cli.observations.target import Target, board_of
 
 SAMPLE = SAMPLES / "bent.csv"
 
@@ -37,6 +38,14 @@ SAMPLE = SAMPLES / "bent.csv"
 @cache
 def bent() -> Calibration:
     return calibrate(read_points(str(SAMPLE)), skew=False)
+
+
+def test_points_in_space_are_not_told_to_be_bent() -> None:
+    rng = np.random.default_rng(3)
+    given, off = rng.uniform(-1000, 1000, (80, 3)), rng.normal(0, 1.5, (80, 3))
+    found = Target(given, given + off, np.ones((80, 3)), np.zeros(80, dtype=np.intp), {}, False, 0.0)
+    assert found.bend() < 6 * 1.5
+    assert target_lines(found, "mm") == ["target: its points lie 2.6 mm rms from where they were given"]
 
 
 def test_the_sample_board_is_found() -> None:

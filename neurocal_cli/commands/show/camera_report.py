@@ -220,12 +220,12 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
         ]
     lines = []
     if not target.only_bends:
-        parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
-        if target.flat or target.stretch() > _LEAST_STRETCH:
+        in_planes = target.has_planes
+        parts = [f"bent by {target.bend():.2g} {unit}"] if in_planes and not target.flat else []
+        if in_planes and (target.flat or target.stretch() > _LEAST_STRETCH):
             parts.append(f"stretched by {100 * target.stretch():.2g} %")
-        lines.append(
-            f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
-        )
+        what = f"{' and '.join(parts)}; " if parts else ""
+        lines.append(f"target: {what}its points lie {found:.2g} {unit} rms from where they were given")
         shift, turn = target.displaced()
         if shift or turn:
             lines.append(
