@@ -77,13 +77,16 @@ def places_of_views(solution: Solution, points: Correspondences) -> NDArray[np.i
 def _borne_out(covariance: Array, residuals: Array) -> float:
     """Share of the noise that is common to all points, estimated also for sigmas chosen by the user.
 
-    A stated sigma that is too small must not make its point an outlier. Real outliers are excluded here.
+    A stated sigma that is too small must not make its point an outlier. Real outliers, whose errors are large
+    both in pixels and by their sigmas, are excluded here.
     """
     length = np.hypot(residuals[:, 0], residuals[:, 1])
+    lengths = np.stack([length, length / np.sqrt(covariance[:, 0])])
     finite = np.isfinite(length)
     if not finite.any():
         return 0.0
-    usual = finite & (length <= _ORDINARY * median(length[finite]))
+    limits = [[_ORDINARY * median(each[finite])] for each in lengths]
+    usual = finite & (lengths <= limits).any(axis=0)
     return common_share(covariance[usual], residuals[usual])
 
 

@@ -56,6 +56,19 @@ def test_a_sigma_that_is_true_is_not_named(share: float, seed: int) -> None:
     assert not any("sigma" in reason for reason in reasons(points))
 
 
+def test_points_that_are_as_uncertain_as_they_say_are_no_outliers() -> None:
+    exact = seen(board(), poses(10, 1), CAMERA.A, 1)
+    noise = np.random.default_rng(1).normal(size=exact.pixels.shape)  # that of `seen` is 0.2 of it
+    sigma = np.where(few(len(exact), 0.3, 1), 1.0, 0.05)
+    noisy = exact.pixels + (sigma[:, None] - 0.2) * noise
+    wrong = np.arange(len(exact)) % 40 == 7
+    noisy[wrong] += 8.0
+    found = calibrate(with_sigma(replace(exact, pixels=noisy), sigma))
+    assert sorted(found.rejected.rows) == np.flatnonzero(wrong).tolist()
+    assert found.verdict is not None
+    assert not any("sigma" in reason for reason in found.verdict.reasons)
+
+
 def test_a_bent_board_is_no_wrong_sigma() -> None:
     points = bent_board(flat(), 4.0)
     told = calibrate(
