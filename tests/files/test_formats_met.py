@@ -1161,6 +1161,27 @@ def test_matrices_that_python_saved_for_matlab_begin_at_zero_with_a_warning(
     assert "its first pixel is taken as 0" in warnings[0]
 
 
+def test_a_region_of_interest_of_ros_is_told(tmp_path: Path) -> None:
+    region = ECHO + "roi: {x_offset: 100, y_offset: 50, height: 240, width: 320, do_rectify: false}\n"
+    (tmp_path / "a.yaml").write_text(region)
+    notes: list[str] = []
+    found = read_cameras([tmp_path / "a.yaml"], notes)
+    assert found.cameras[0].image_size == (640, 480)
+    assert any("neurocal resize CAMERA.yaml --crop 100 50 320 240" in note for note in notes)
+
+
+def test_dictionaries_of_anipose_in_a_list_are_a_rig(tmp_path: Path) -> None:
+    cameras = [
+        {"name": name, "size": [640, 480], "matrix": K, "distortions": D5, "rotation": turn, "translation": t}
+        for name, turn, t in (("c01", [0, 0, 0], [0, 0, 0]), ("c02", [0, 0.3, 0], [-110, 1, 20]))
+    ]
+    (tmp_path / "a.json").write_text(json.dumps(cameras))
+    found = read_cameras([tmp_path / "a.json"])
+    check(found.cameras[1], E, D5)
+    assert [camera.name for camera in found.cameras] == ["c01", "c02"]
+    assert found.relative[0].t.tolist() == [-110, 1, 20]
+
+
 def test_a_struct_of_matlab_may_have_any_name_if_it_is_the_only_one(tmp_path: Path) -> None:
     struct = {"K": np.add(K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]]), "RadialDistortion": D5[:2]}
     struct["TangentialDistortion"] = D5[2:4]

@@ -11,13 +11,15 @@ lies in the first view; of a single camera, each view is one.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after
 from neurocal_cli.files.exchange.tree_paths import toml_text
@@ -27,14 +29,25 @@ from neurocal_cli.files.tree_fields import Field
 # anipose, freemocap and caliscope: TOML with a section for each camera, posed from the world to the camera.
 def _sections(document: Document) -> dict[str, Field]:
     """Sections of cameras, by name."""
-    below = document.tree.get("cameras")
-    sections = below if isinstance(below, dict) else document.tree
+    tree = document.tree or _listed(document)
+    below = tree.get("cameras")
+    sections = below if isinstance(below, dict) else tree
     root = Field(sections, document.source, "cameras" if isinstance(below, dict) else "")
     return {
         key: root[key]
         for key, one in sections.items()
         if isinstance(one, dict) and {"matrix", "distortions"} <= set(one)
     }
+
+
+def _listed(document: Document) -> dict[str, Any]:
+    """The dictionaries of a list by their names, as programs save those of anipose in JSON."""
+    with suppress(FormatError):
+        listed = document.root.value
+        if isinstance(listed, list) and all(isinstance(one, dict) for one in listed):
+            named = {str(one.get("name")): one for one in listed}
+            return named if len(named) == len(listed) else {str(k): one for k, one in enumerate(listed)}
+    return {}
 
 
 def _anipose_parts(document: Document) -> dict[str, Field]:
@@ -80,7 +93,7 @@ ANIPOSE = replace(
     program="anipose",
     name="name",
     told=_sections,
-    files="calibration.toml of anipose, freemocap",
+    files="calibration.toml of anipose, freemocap; list of the same in JSON, of AIST++",
     pose=PoseKeys("rotation:vector translation", frame="world"),
     whole=lambda trees, cameras: (
         {f"cam_{k}": tree for k, tree in enumerate(trees)} | {"metadata": {"adjusted": False}}

@@ -26,6 +26,7 @@ from neurocal_cli.files.tree_fields import Field, is_number
 
 _TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)  # of ost.txt
 _RECTIFIED = {"rectification_matrix": 9, "projection_matrix": 12}
+_REGION = ("x_offset", "y_offset", "width", "height")
 _LABEL = re.compile(r"\s*\[?([A-Za-z][\w /.-]*)\]?\s*").fullmatch
 
 
@@ -47,6 +48,12 @@ def _parts(document: Document) -> dict[str, Field]:
     keys.refuse_unread()
     if root.get("binning_x", 0).integer() > 1 or root.get("binning_y", 0).integer() > 1:
         document.note("has binning; the camera is that of the images before it")
+    corner_and_size = [root.get("roi", {}).get(key, 0).value for key in _REGION]
+    if any(corner_and_size):
+        document.note(
+            "has a region of interest; the camera is that of the whole images, and neurocal resize "
+            f"CAMERA.yaml --crop {' '.join(map(str, corner_and_size))} makes that of the region"
+        )
     return {"camera": Field(tree, document.source)}
 
 
