@@ -72,6 +72,10 @@ def test_the_largest_size_with_enough_votes_is_the_boards(
             [SeenBoard((8, 6), WHOLE, ((8, 6), (7, 6)))] * 3,
             "the images show 3 chessboards beside each other, of 7 x 6, 8 x 6 and 8 x 6 inner vertices",
         ),
+        (
+            [SeenBoard((9, 6), WHOLE, ((9, 6),))] * 3,
+            "of 9 x 6 and 9 x 6 inner vertices; cut pictures that hold both images of a stereo camera apart",
+        ),
     ],
 )
 def test_images_that_do_not_tell_the_size_are_refused(seen: list[SeenBoard], said: str) -> None:
