@@ -21,6 +21,7 @@ combinations count as known no better than a third of what a pixel is.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -54,6 +55,7 @@ class Drift:
     changes: Array  # (3,) relative change of scale, moves of the image centre in u and v [px]
     changes_std: Array  # (3,)
     share: float  # of pairs of calibrations of an unchanged camera that differ as much
+    error_px: float = np.nan  # rms error of the new camera on the points that it was calibrated from
 
     @property
     def different(self) -> bool:
@@ -140,7 +142,7 @@ def drift_since(calibration: Calibration, points: Correspondences) -> Drift | No
         new = calibrate(points, distortion=lens, skew=skew, seed=calibration.seed)
         if not new.converged or spare_equations(new) < _SPARE:
             return None
-        return find_drift(calibration, new)
+        return replace(find_drift(calibration, new), error_px=new.rmse_px)
     except NeurocalError:
         return None
 

@@ -228,9 +228,10 @@ def judged_by_points(
     `drift` is that from the calibration to a camera calibrated from these points, if they determine one.
     """
     seen = given.residuals[np.isfinite(given.residuals[:, 0])]
-    finding = given_error(
-        verdict, calibration.rmse_px, calibration.points, (seen**2).sum(axis=1), given.n_points
-    )
+    # Points may be less accurate than those of the calibration, and of the same camera.
+    noise = np.nan if drift is None or drift.different else drift.error_px
+    error = float(np.fmax(calibration.rmse_px, noise))
+    finding = given_error(verdict, error, calibration.points, (seen**2).sum(axis=1), given.n_points)
     return with_findings(verdict, [finding, *given_camera(given.fit), *changed_camera(drift)])
 
 
@@ -294,9 +295,11 @@ def given_error(
     # The relative standard deviation of an rms error of n numbers is 1 / sqrt(2 n); a point has two.
     ratio = error / (own * (1 + TOLD / np.sqrt(4 * seen)))
     grade = max(ELSEWHERE.grade(ratio), ERROR.grade(error / image_diagonal(own_points)))
+    more = "large"
+    if ELSEWHERE.grade(ratio):
+        more = f"{two_digits(error / own)} times the {own:.3g} px of the calibration"
     return (
         grade,
-        f"the rms error of {error:.3g} px on the given points is {two_digits(error / own)} times the "
-        f"{own:.3g} px of the calibration",
+        f"the rms error of {error:.3g} px on the given points is {more}",
         f"check that the given points are of the same {same}; look at the views with the largest errors",
     )

@@ -15,6 +15,7 @@ from support.slow_cases import slow_but
 from support.wrong_inputs import CAMERA, board, flat, poses, seen
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, write_calibration
+from neurocal_cli.calibration.drift import drift_since
 from neurocal_cli.calibration.evaluation import judged_by_points
 from neurocal_cli.files.points_csv import write_points
 
@@ -72,6 +73,18 @@ def test_an_error_of_100_px_is_never_good() -> None:
 def test_points_of_another_zoom_are_not_good(focal: float) -> None:
     new = other_images(focal)
     assert word(new.select(new.view_index < 4)) != "good"
+
+
+def test_points_of_the_same_camera_may_be_less_accurate() -> None:
+    points = other_images()
+    noise = np.random.default_rng(4).normal(0, 0.6, points.pixels.shape)
+    evaluation = evaluate_camera(found(), replace(points, pixels=points.pixels + noise))
+    assert found().verdict is not None
+    assert evaluation.fit is not None
+    drift = drift_since(found(), evaluation.fit.points)
+    assert drift is not None
+    assert not drift.different
+    assert judged_by_points(found().verdict, found(), evaluation, drift).word == "good"
 
 
 def test_points_behind_the_camera_are_poor() -> None:
