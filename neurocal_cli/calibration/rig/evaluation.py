@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibrate import fit_poses
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
+from neurocal_cli.calibration.drift import drift_since
 from neurocal_cli.calibration.evaluation import (
     given_camera,
     given_error,
@@ -344,8 +345,10 @@ class _Evaluator:
             return None
         residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
         squares = residuals[np.isfinite(residuals)] ** 2
-        same = "rig, with both cameras as they were"
-        findings = [given_error(verdict, rig.rmse_px, rig.left.points, squares, len(residuals), same)]
+        given = rig.left.points, squares, len(residuals), "rig, with both cameras as they were"
+        findings = [given_error(verdict, rig.rmse_px, *given)]
+        if findings[0][0] and (noise := self._noise_of_given()) is not None:
+            findings = [given_error(verdict, max(rig.rmse_px, noise), *given)]
         if findings[0][0]:
             findings = [*self._other_size(rig, findings[0][0]), *findings]
         for side, fit in zip(("left", "right"), self.fitted or (None, None), strict=True):
@@ -353,6 +356,15 @@ class _Evaluator:
                 (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(fit)
             ]
         return with_findings(verdict, findings)
+
+    def _noise_of_given(self) -> float | None:
+        """Rms error of cameras calibrated from the given points [px], if both are as they were."""
+        drifts = [
+            drift_since(camera, fit.points)
+            for camera, fit in zip(self.cameras, self.fitted or (), strict=False)
+        ]
+        errors = [drift.error_px for drift in drifts if drift is not None and not drift.different]
+        return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) == 2 else None
 
     def _other_size(self, rig: StereoRig, grade: int) -> Iterator[Finding]:
         """The finding about given points of a target of another size or unit, if that is what is wrong.

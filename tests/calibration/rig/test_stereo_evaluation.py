@@ -185,6 +185,19 @@ def test_given_points_of_another_rig_are_not_good(what: str) -> None:
     assert any("on the given points" in reason for reason in verdict.reasons)
 
 
+def test_given_points_of_the_same_rig_may_be_less_accurate() -> None:
+    left, right = calibrated(flat())
+    rng = np.random.default_rng(9)
+    one, other = (
+        replace(points, pixels=points.pixels + rng.normal(0, 0.6, points.pixels.shape))
+        for points in seen_again(flat(), rng)
+    )
+    verdict, own = evaluate_stereo(left, right, (one, other)).verdict, evaluate_stereo(left, right).verdict
+    assert verdict is not None
+    assert own is not None
+    assert verdict.word == own.word
+
+
 def changed(points: Correspondences, view: str, order: Array) -> Correspondences:
     """The pixels of one view in another order."""
     rows = np.flatnonzero(np.array(points.view_names)[points.view_index] == view)
