@@ -82,7 +82,8 @@ def glass(seen: Seen) -> Array | None:
 def no_pupil(seen: Seen) -> Array:
     """Rays that meet the axis of the lens elsewhere, the more they lean."""
     r2 = ((seen.from_centre / seen.focal[:, None]) ** 2).sum(axis=1)
-    return (seen.by_depth * r2[:, None])[:, None]
+    by_depth = seen.by_pose[:, 5] / seen.size[:, None, None]
+    return (by_depth * r2[:, None])[:, None]
 
 
 def squeezed(seen: Seen) -> Array | None:

@@ -72,7 +72,6 @@ class Seen:
     by_entries: Array  # (T, 5, 2, n) derivatives of the pixels by the entries of A
     pixels: Array  # (T, 2, n) where the camera sees the points, from the middle of the image; over S1
     observed: Array  # (T, 2, n) where they were observed [px]
-    by_depth: Array  # (T, 2, n) derivatives by a shift along the axis of the lens [world unit]
     from_centre: Array  # (T, 2, n) the same places as `pixels`, from the image centre
     focal: Array  # (2,) focal lengths along u and v, over S1
     by_pose: Array  # (T, 6, 2, n) derivatives by the poses of the views
@@ -210,7 +209,7 @@ def _derivatives(
         to_camera = np.einsum("ia,tin->tan", board.axes, -back @ tau[:, :, None] - local)
         from_centre, focal = observed - off - state.entries[0, 3:, None], state.entries[0, [0, 2]]
         seen = Seen(
-            J[:, :5], observed - off - middle[:, None], px, by_pose[:, 5] / scale, from_centre, focal,
+            J[:, :5], observed - off - middle[:, None], px, from_centre, focal,
             by_pose, tau, views.scale[view] / views.scale.mean(), board.size / views.scale.mean(),
             by_target, at, to_camera, board.flat,
         )  # fmt: skip

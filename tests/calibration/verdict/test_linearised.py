@@ -55,6 +55,22 @@ def with_pixels(points: Correspondences, by: Array) -> Correspondences:
     return replace(points, pixels=points.pixels + by)
 
 
+def test_all_causes_have_the_same_evidence_in_metres_and_millimetres() -> None:
+    points, state = exact()
+    view = points.view_index
+    x = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
+    off = points.pixels - state.entries[0, 3:]  # rays that lean meet the axis up to 30 mm away
+    moved = 100.0 * off * ((x[:, :2] / x[:, 2:]) ** 2).sum(axis=1, keepdims=True) / x[:, 2:]
+    points = with_pixels(points, moved + np.random.default_rng(0).normal(0, 0.1, points.pixels.shape))
+    found = []
+    for scale in (1.0, 1e-3):
+        world, there = scale * points.world, replace(state, t=scale * state.t)
+        lin, _, _ = at(replace(points, world=world), there, 5)
+        found.append({one.rival.cause: one.evidence for one in estimates(lin, lin.spare, RIVALS, -np.inf)})
+    assert "rays that do not meet in one point" in found[0]
+    assert found[0] == pytest.approx(found[1], abs=1e-3)
+
+
 def test_a_bend_takes_the_residuals_of_a_bent_board_away() -> None:
     points, state = exact()
     given = board() - board().mean(axis=0)
