@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from support.marked import errors_of, marked_scene, plane_of, taken, truth_of
 from support.picture_bound import scene_bound
-from support.pictures import Illumination, Scene
+from support.pictures import Illumination, Rendered, Scene, digitised, ground_truth, image_light
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
+from support.uneven_light import half_in_shadow
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
@@ -238,6 +239,22 @@ def test_tags_are_measured_at_their_corners_and_edges(points: str, most: float) 
     assert np.sqrt((error**2).mean()) < most
     assert 0.4 < squared.mean() < 2
     assert {name.split(":")[0] for name in found.ids} == {str(k) for k in range(9)}
+
+
+def test_tags_half_in_a_soft_shadow_are_measured_where_the_light_does_not_change() -> None:
+    """Polynomials through a shadow have slopes beside its border; within 20 px, edges have gradients."""
+    every = []
+    for seed in (0, 1):
+        scene = marked_scene(plane_of("aprilgrid:4x3:40:0.3"), seed, 44.0)
+        truth = ground_truth(scene)
+        shadow = half_in_shadow(0.4, 8.0)
+        light = shadow(image_light(scene, 4), truth.planes[0].vertices, np.random.default_rng(seed))
+        image = digitised(scene.sensor, light, np.random.default_rng([seed, 45]))
+        found = detect_points(image, scene.board, "vertices")
+        every.append(errors_of(found, Rendered(image, truth)))
+    error, squared = (np.concatenate(part) for part in zip(*every, strict=True))
+    assert np.sqrt((error**2).mean()) < 0.013
+    assert squared.mean() < 1.3
 
 
 def test_a_marker_that_was_read_wrongly_is_left_out() -> None:

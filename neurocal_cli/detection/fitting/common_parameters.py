@@ -42,7 +42,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     tail_terms,
 )
 from neurocal_cli.detection.fitting.map_fit import MapFit, WideMap
-from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
+from neurocal_cli.detection.fitting.shading import Shading, excess_nearby, excess_variance, polynomial_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single
 from neurocal_cli.detection.medians import upper_median
@@ -62,6 +62,8 @@ _ENOUGH = 10000  # pixels, enough to estimate the profile's shape
 # are weak compared with ten thousand pixels.
 _TAILS, _RESPONSE = 0.01, 0.06
 _RIDGE = 1e-5
+_NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
+_NO_GRADIENT = 1e-12  # 1/px^2
 _LEAST_SPREAD = 0.0002  # least prior variance of the levels, in variances of the noise
 _TINY = np.float32(1e-30)
 _FAR, _PLACES = 4.0, 401  # samples of the profile: sigma on both sides, and their number
@@ -166,6 +168,54 @@ def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:
     light, wanted = (response(x, shape.nonlinearity)[0] for x in (here, there))
     change = np.linalg.lstsq(terms[0].T, (wanted - light)[0], rcond=_RIDGE)[0]
     return replace(shape, nonlinearity=shape.nonlinearity + change)
+
+
+def with_gradients(fit: BatchFit, along: tuple[Single, ...], of_blur: bool, place: Array | None) -> BatchFit:
+    """Continue fits by a step that also fits gradients of the light, and of the blur, along distances (E, N).
+
+    Gradients that shading and blur of the board do not contain displace an edge, or a vertex, where opposite
+    squares then differ. They are relative to light and blur, and have normal priors. The variance of a prior
+    is what the estimates scatter more than by their errors: all of them and, beside the border of a shadow,
+    those around each `place` (E, 2) [px], if it is given. In even light and focus this is nothing, and the
+    fits stay as they are.
+    """
+    data, rows, size = fit.pixels, fit.linear.rows, fit.values.shape[1]
+    mean, contrast, sigma = fit.values[:, MEAN:].T.astype(np.float32)[:, :, None]
+    light = (mean + contrast * fit.linear.x) * data.root
+    changed = [light, rows[:, 1 + size + BLUR] * sigma][: 1 + of_blur]
+    patterns = np.stack([what * d for what in changed for d in along], axis=1)
+    # Products with the residual, with the derivatives by the values, and with each other.
+    both = (patterns @ rows.swapaxes(1, 2))[:, :, : size + 1].astype(float)
+    products = (patterns @ patterns.swapaxes(1, 2)).astype(float)
+    right, cross = both[:, :, :1], both[:, :, 1:]
+    back = fit.covariance @ cross.swapaxes(1, 2)
+    # At the minimum, the values need no step of their own: what is left determines the gradients.
+    left = products - cross @ back
+    diagonal = np.einsum("eii->ei", left)  # a view
+    diagonal *= 1 + _RIDGE
+    diagonal += _RIDGE
+    free = np.linalg.inv(left)
+    variance, found = np.einsum("eii->ei", free), (free @ right)[:, :, 0]
+    believed = np.zeros_like(variance)
+    for k in range(len(changed)):
+        kind = slice(k * len(along), (k + 1) * len(along))
+        spread = excess_variance(found[:, kind].ravel(), variance[:, kind].ravel())
+        if spread > _NOTABLE * upper_median(variance[:, kind]):
+            believed[:, kind] = spread
+    if place is not None:
+        kind = slice(0, len(along))
+        nearby = excess_nearby(place, found[:, kind], variance[:, kind])
+        believed[:, kind] = np.maximum(believed[:, kind], nearby)
+    used = np.flatnonzero(believed.any(axis=0))
+    if not len(used):
+        return fit
+    prior = np.eye(len(used)) / np.maximum(believed[:, used, None], _NO_GRADIENT)
+    right, cross, back = right[:, used], cross[:, used], back[:, :, used]
+    gradients = np.linalg.solve(left[:, used[:, None], used] + prior, right)
+    step = -(back @ gradients)[:, :, 0]
+    lost = cross.swapaxes(1, 2) @ np.linalg.solve(products[:, used[:, None], used] + prior, cross)
+    chi2 = fit.chi2 - (right.swapaxes(1, 2) @ gradients)[:, 0, 0]
+    return replace(fit, values=fit.values + step, information=fit.information - lost, chi2=chi2)
 
 
 def board_blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothMap) -> BoardBlur | FieldBlur:

@@ -35,7 +35,7 @@ _RICHER, _GAIN, _NOTABLE = (10, 15, 21), 0.5, 1.0
 _EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which degree 2 is sufficient
 # A shadow is looked for if so many levels differ so much from the polynomials, relative to the contrast. It
 # is found if nearby levels predict a level with an error that is smaller by a factor.
-_SHADOWED, _OFF, _CLEARLY = 0.03, 0.1, 0.7
+_SHADOWED, _OFF, _CLEARLY = 0.03, 0.1, 0.9
 
 
 @frozen_dataclass(eq=False)
@@ -76,6 +76,11 @@ class Shading:
         """(2, N) variance [DN^2] of single dark and light levels around those at places (N, 2)."""
         return np.broadcast_to(self.spread[:, None], (2, len(place)))
 
+    @property
+    def has_slopes(self) -> bool:
+        """Whether the light may change within a square."""
+        return len(self.dark) > _TERMS[-1]
+
     def slopes(self, place: Array) -> tuple[Array, Array]:
         """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
         du, dv = _polynomial_slopes(self.frame, place, len(self.dark))
@@ -102,6 +107,11 @@ class LocalShading(Shading):
     near: tuple[Array, Array]
     above: tuple[Array, Array]  # two arrays (N,) [DN]: their differences from the polynomials
     has_border: bool  # of a shadow; the levels at it are uncertain
+
+    @property
+    def has_slopes(self) -> bool:
+        """Whether the light may change within a square."""
+        return self.has_border
 
     @classmethod
     def of(cls, smooth: Shading, dark: Levels, light: Levels, has_border: bool = False) -> Shading:
@@ -143,6 +153,11 @@ def _nearness(near: Array, place: Array, itself: bool = True) -> Array:
     width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
     weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
     return np.asarray(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
+
+
+def excess_nearby(place: Array, residual: Array, variance: Array) -> Array:
+    """Variance (N, 1) of residuals (N, K) around places (N, 2) beyond their known variances (N, K)."""
+    return np.maximum(_nearness(place, place) @ (residual**2 - variance).mean(axis=1, keepdims=True), 0.0)
 
 
 def _unlike_others(place: Array, value: Array) -> Array:
@@ -219,7 +234,8 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
 def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     """Raise the degree of polynomials as far as required, or follow nearby levels if these predict better.
 
-    They do where the board is partly in a shadow, whose border polynomials cannot follow.
+    They do where the board is partly in a shadow, whose border polynomials cannot follow. The slopes of these
+    would be wrong on both sides of it, so nearby levels are followed from even ones.
     """
     both = dark, light
     if min(len(levels.level) for levels in both) == 0:
@@ -230,7 +246,9 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     if not shadowed and smooth.spread.max() < (_EVEN * half) ** 2:
         return smooth
     richer = _richer(smooth, dark, light)
-    local = LocalShading.of(smooth, dark, light, has_border=True) if shadowed else richer
+    usual = [np.array([upper_median(levels.level)]) for levels in both]
+    even = replace(smooth, dark=usual[0], light=usual[1])
+    local = LocalShading.of(even, dark, light, has_border=True) if shadowed else richer
     if not isinstance(local, LocalShading):
         return richer
     by_local = [_unlike_others(near, above) for near, above in zip(local.near, local.above, strict=True)]

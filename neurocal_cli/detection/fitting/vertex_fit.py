@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import (
-    BLUR,
-    MEAN,
     BatchFit,
     FitPixels,
     Linearised,
@@ -34,7 +32,13 @@ from neurocal_cli.detection.fitting.batched_newton import (
     fit_batch,
     rows_for,
 )
-from neurocal_cli.detection.fitting.common_parameters import FieldBlur, correlation, level_prior, with_shift
+from neurocal_cli.detection.fitting.common_parameters import (
+    FieldBlur,
+    correlation,
+    level_prior,
+    with_gradients,
+    with_shift,
+)
 from neurocal_cli.detection.fitting.edge_fit import ALONE, REACH
 from neurocal_cli.detection.fitting.edge_profile import (
     Real,
@@ -56,11 +60,9 @@ FIRST, SECOND = 0, 2
 # Insensitive.
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
 _NO_VARIANCE = 1e-12  # px^2, of fits that are not determined
-_RIDGE = 1e-6  # keeps the gradients of vertices without pixels finite
 # Standard deviations beyond which the tilt of a line is not that of the map, and squared correlation with the
 # offset from which it matters. It does not where the light of a board of equal squares is uneven.
 _OUTLIER, _TELLING = 4.0, 0.1
-_NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
 # Number of terms of the series for crossings with a cosine below each limit, and for all others;
 # test_fit_models.py compares them with a rendered cross.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
@@ -93,7 +95,9 @@ def fit_grid_vertices(
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
     fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
     fit = without_outlying_pixels(fit, STEPS)
-    fit = _with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
+    fit = with_gradients(
+        fit, (data.d1, data.d2), isinstance(blur, FieldBlur), place if fitted.shading.has_slopes else None
+    )
     if fitted.shifts.used:
         fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), LEAST_SCALE))
@@ -280,45 +284,3 @@ def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, 
         by_z1 -= power * now1 * last2
         by_z2 -= power * last1 * now2
     return series, by_z1, by_z2
-
-
-def _with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
-    """Continue the fits of vertices by a step that also fits gradients of the light, and of the blur.
-
-    Gradients that shading and blur of the board do not contain displace a vertex, because opposite squares
-    then differ. They are relative to light and blur, and have normal priors. The variance of a prior is what
-    the estimates scatter more than by their errors. In even light and focus this is nothing, and the fits
-    stay as they are.
-    """
-    data, rows, size = fit.pixels, fit.linear.rows, fit.values.shape[1]
-    assert isinstance(data, VertexPixels)
-    mean, contrast, sigma = fit.values[:, MEAN:].T.astype(np.float32)[:, :, None]
-    light = (mean + contrast * fit.linear.x) * data.root
-    changed = [light, rows[:, 1 + size + BLUR] * sigma][: 1 + of_blur]
-    patterns = np.stack([what * d for what in changed for d in (data.d1, data.d2)], axis=1)
-    # Products with the residual, with the derivatives by the values, and with each other.
-    both = (patterns @ rows.swapaxes(1, 2))[:, :, : size + 1].astype(float)
-    own = (patterns @ patterns.swapaxes(1, 2)).astype(float)
-    right, cross = both[:, :, :1], both[:, :, 1:]
-    back = fit.covariance @ cross.swapaxes(1, 2)
-    # At the minimum, the values need no step of their own: what is left determines the gradients.
-    left = own - cross @ back
-    diagonal = np.einsum("eii->ei", left)  # a view
-    diagonal *= 1 + _RIDGE
-    diagonal += _RIDGE
-    free = np.linalg.inv(left)
-    variance, found = np.einsum("eii->ei", free), (free @ right)[:, :, 0]
-    kinds = [np.array([2 * k, 2 * k + 1]) for k in range(len(changed))]
-    spread = [excess_variance(found[:, kind].ravel(), variance[:, kind].ravel()) for kind in kinds]
-    usual = [upper_median(variance[:, kind]) for kind in kinds]
-    notable = [k for k in range(len(kinds)) if spread[k] > _NOTABLE * usual[k]]
-    if not notable:
-        return fit
-    used = np.concatenate([kinds[k] for k in notable])
-    prior = np.diag(np.repeat([1 / spread[k] for k in notable], 2))
-    right, cross, back = right[:, used], cross[:, used], back[:, :, used]
-    gradients = np.linalg.solve(left[:, used[:, None], used] + prior, right)
-    step = -(back @ gradients)[:, :, 0]
-    lost = cross.swapaxes(1, 2) @ np.linalg.solve(own[:, used[:, None], used] + prior, cross)
-    chi2 = fit.chi2 - (right.swapaxes(1, 2) @ gradients)[:, 0, 0]
-    return replace(fit, values=fit.values + step, information=fit.information - lost, chi2=chi2)

@@ -28,7 +28,14 @@ from neurocal_cli.detection.fitting.edge_profile import (
 )
 from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_again, fit_from, map_of_vertices
 from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
-from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fitting.shading import (
+    LEVEL_VARIANCE,
+    Levels,
+    Shading,
+    adapted_shading,
+    fit_shading,
+    square_levels,
+)
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.grid import Grid
@@ -123,7 +130,7 @@ def _levels(at: SmoothMap, lines: Lines, mean: Array, contrast: Array) -> tuple[
     """Mean levels and half contrasts of edges, and the shading through them."""
     variance = np.ones(len(mean))
     dark, light = (Levels(lines.middle, mean + sign * contrast, variance) for sign in (-1, 1))
-    return mean, contrast, fit_shading(at.frame, dark, light)
+    return mean, contrast, adapted_shading(fit_shading(at.frame, dark, light), dark, light)
 
 
 def _by_pixels(
