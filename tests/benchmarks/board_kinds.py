@@ -1,7 +1,8 @@
 """Boards of four kinds in ten conditions: errors over the Cramer-Rao bound and the covariance, beside others.
 
 Run with ``PYTHONPATH=tests python tests/benchmarks/board_kinds.py FIRST NUMBER [CONDITION/KIND ...]``: each
-cell has NUMBER pictures, from the seed FIRST on. `aprilgrid` of PyPI is compared if it is installed.
+cell has NUMBER pictures, from the seed FIRST on. `aprilgrid` and `lensboy` of PyPI are compared if they are
+installed.
 
 A cell tells the rms error of the vertices over the bound, their squared error over the covariance, both with
 the standard deviation by leaving out one picture after the other, the share of the vertices that are found,
@@ -12,7 +13,9 @@ import conftest  # noqa: F401 - one thread, before NumPy loads its BLAS
 
 # isort: split
 import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field, replace
+from io import StringIO
 
 import cv2
 import numpy as np
@@ -219,7 +222,14 @@ def others(kind: str, plane: object, image: Array) -> dict[str, Array]:
     if kind == "charuco":
         family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
         board = cv2.aruco.CharucoBoard((10, 7), 28.0, 21.0, family)
-        return {"OpenCV": _points(cv2.aruco.CharucoDetector(board).detectBoard(image)[0])}
+        result = {"OpenCV": _points(cv2.aruco.CharucoDetector(board).detectBoard(image)[0])}
+        try:
+            from lensboy import extract_frames_from_charuco
+        except ImportError:
+            return result
+        with redirect_stdout(StringIO()):
+            frames = extract_frames_from_charuco(board, [image])[1]
+        return {**result, "lensboy": _points(frames[0].detected_points_in_image if frames else None)}
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits, parameters.cornerRefinementMethod = 2, cv2.aruco.CORNER_REFINE_SUBPIX

@@ -133,7 +133,7 @@ def fit_grid(grid_image: GridImage, undo: bool = True) -> GridFit:
     """Run all stages, after sharpening by the camera is undone if `undo`."""
     found = map_of_vertices(grid_image)
     dark, light, noise = square_levels(grid_image.image, grid_image.grid, found.map)
-    shading = adapted_shading(fit_shading(found.map.frame, dark, light), dark, light)
+    shading = fit_shading(found.map.frame, dark, light)
     if isinstance(found.map, WideMap):
         shading = LocalShading.of(shading, dark, light)
     mapped, sigma, levels, profile = _by_moments(grid_image, found, shading)
@@ -338,7 +338,7 @@ def _fine_fit(
         shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
         fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
-    if shading.has_slopes and isinstance(fit.pixels, EdgePixels):
+    if isinstance(shading, LocalShading) and shading.has_slopes and isinstance(fit.pixels, EdgePixels):
         fit = with_gradients(fit, (fit.pixels.d,), False, lines.middle)
     return fit, noise
 

@@ -231,11 +231,12 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     return coefficients, spread + count / n * upper_median(levels.variance)
 
 
-def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
+def adapted_shading(smooth: Shading, dark: Levels, light: Levels, raised: bool = True) -> Shading:
     """Raise the degree of polynomials as far as required, or follow nearby levels if these predict better.
 
     They do where the board is partly in a shadow, whose border polynomials cannot follow. The slopes of these
-    would be wrong on both sides of it, so nearby levels are followed from even ones.
+    would be wrong on both sides of it, so nearby levels are followed from even ones. If not `raised`, the
+    degree stays, because rough levels scatter around any polynomial.
     """
     both = dark, light
     if min(len(levels.level) for levels in both) == 0:
@@ -245,7 +246,7 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     shadowed = np.mean(off > _OFF * 2 * half) >= _SHADOWED
     if not shadowed and smooth.spread.max() < (_EVEN * half) ** 2:
         return smooth
-    richer = _richer(smooth, dark, light)
+    richer = _richer(smooth, dark, light) if raised else smooth
     usual = [np.array([upper_median(levels.level)]) for levels in both]
     even = replace(smooth, dark=usual[0], light=usual[1])
     local = LocalShading.of(even, dark, light, has_border=True) if shadowed else richer

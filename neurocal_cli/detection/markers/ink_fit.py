@@ -130,7 +130,8 @@ def _levels(at: SmoothMap, lines: Lines, mean: Array, contrast: Array) -> tuple[
     """Mean levels and half contrasts of edges, and the shading through them."""
     variance = np.ones(len(mean))
     dark, light = (Levels(lines.middle, mean + sign * contrast, variance) for sign in (-1, 1))
-    return mean, contrast, adapted_shading(fit_shading(at.frame, dark, light), dark, light)
+    smooth = fit_shading(at.frame, dark, light)
+    return mean, contrast, adapted_shading(smooth, dark, light, raised=False)
 
 
 def _by_pixels(
