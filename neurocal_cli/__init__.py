@@ -9,6 +9,7 @@ it needs.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +36,10 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig as evaluate_rig
     from neurocal_cli.calibration.rig.triangulation import triangulate as triangulate
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens as evaluate_lens
+    from neurocal_cli.calibration.zoom.fit import LensCameras as LensCameras
     from neurocal_cli.calibration.zoom.fit import fit_lens as fit_lens
     from neurocal_cli.calibration.zoom.fit import fit_lens_cameras as fit_lens_cameras
+    from neurocal_cli.calibration.zoom.settings import LensPoints as LensPoints
     from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens as ZoomLens
     from neurocal_cli.calibration.zoom.zoom_lens import camera_at as camera_at
     from neurocal_cli.camera.camera import Camera as Camera
@@ -64,6 +67,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.rig_points import read_rig_points as read_rig_points
     from neurocal_cli.files.rig_yaml import read_rig as read_rig
     from neurocal_cli.files.rig_yaml import read_stereo_rig as read_stereo_rig
+    from neurocal_cli.network.backprop import BackpropOptions as BackpropOptions
     from neurocal_cli.observations.board import Board as Board
     from neurocal_cli.observations.points import Correspondences as Correspondences
     from neurocal_cli.observations.target import Target as Target
@@ -73,6 +77,9 @@ __version__ = "0.1.0"
 
 # The public names and their modules.
 _HOMES = {
+    "BackpropOptions": "network.backprop",
+    "LensCameras": "calibration.zoom.fit",
+    "LensPoints": "calibration.zoom.settings",
     "Board": "observations.board",
     "Calibration": "calibration.calibration",
     "Camera": "camera.camera",
@@ -136,4 +143,20 @@ __all__ = list(_HOMES)
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    import_module(f"{__name__}.{_HOMES[name]}")
+    from neurocal_cli.camera.argument_kinds import checked
+
+    for public, home in _HOMES.items():  # with the classes of what it returns
+        module = sys.modules.get(f"{__name__}.{home}")
+        if public not in globals() and hasattr(module, public):
+            globals()[public] = checked(getattr(module, public), _Names())
+    return globals()[name]
+
+
+class _Names(dict[str, Any]):
+    """The public names, where annotations have them and their modules do not."""
+
+    def __missing__(self, name: str) -> Any:
+        if name not in _HOMES:
+            raise KeyError(name)
+        return __getattr__(name)

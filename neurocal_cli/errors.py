@@ -52,13 +52,6 @@ class UsageError(NeurocalError):
     exit_code = 2
 
 
-def check_kind(name: str, value: object, kind: type | tuple[type, ...], instead: str) -> None:
-    """Refuse an argument of other kinds with an InputError, which says what to give instead."""
-    if not isinstance(value, kind):
-        kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
-        raise InputError(f"{name} must be a {kinds}, not {type(value).__name__}; give {instead}")
-
-
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Refuse a value that is not one of an option's choices, with a UsageError that names them."""
     if value not in choices:

@@ -25,7 +25,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES, ENTRY_NAMES, image_points
 from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.errors import InputError, UsageError, check_kind
+from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.observations.points import Correspondences
 
 _LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's mean direction
@@ -226,7 +226,6 @@ def problem_for(
     poses = _poses(points, extrinsics) if type == 4 else None
     if square:
         fix = _both_alphas(fix or {}, type, skew)
-    check_kind("fix", fix or {}, Mapping, "a dict such as {'u0': 319.5}")
     held: dict[str, float] = {}
     for name, number in (fix or {}).items():
         _check_fixed(name, number, given, type, skew, distortion.model)
@@ -328,9 +327,6 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
 def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
     if extrinsics is None:
         raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
-    wrong = "the extrinsics must be a dict with a Pose for each view"
-    if not isinstance(extrinsics, Mapping):
-        raise UsageError(wrong)
     missing = [name for name in points.view_names if name not in extrinsics]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
@@ -338,8 +334,6 @@ def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> di
             f"the extrinsics have no view named {missing[0]!r}{more}; they have "
             f"{', '.join(repr(name) for name in list(extrinsics)[:5]) or 'none'}"
         )
-    if not all(isinstance(extrinsics[name], Pose) for name in points.view_names):
-        raise UsageError(wrong)
     return {name: extrinsics[name] for name in points.view_names}
 
 

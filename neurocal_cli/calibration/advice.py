@@ -26,7 +26,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
-from neurocal_cli.errors import InputError, check_kind
+from neurocal_cli.errors import InputError
 
 _POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # shares of the image's width and height
 _WIDTHS = (0.3, 0.5, 0.75)  # width of the target as a share of the image's width
@@ -69,7 +69,6 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     InputError
         The calibration has no points, no image size or no free parameter, or no view shows the whole target.
     """
-    check_kind("calibration", calibration, Calibration, "what calibrate made; advise_rig is for rigs")
     known, world = _Known.of(calibration), points_of_target(calibration)
     options = candidates(calibration)
     if not options:

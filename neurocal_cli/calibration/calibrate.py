@@ -24,17 +24,17 @@ from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion, Model
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice, check_kind, check_seed
+from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_seed
 from neurocal_cli.network.options import Options, Progress, options_for
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import TARGETS, Target, TargetChoice
+from neurocal_cli.observations.target import Target, TargetChoice
 
 if TYPE_CHECKING:
     from neurocal_cli.network.backprop import BackpropOptions
 
 Method = Literal["neuro", "linear", "nonlinear", "tsai"]
 Trainer = Literal["lm", "backprop"]
-Lens = Model | Literal["auto", "plumb-line"]
+Lens = Literal["auto", "plumb-line"] | Model
 Outliers = Literal["reject", "keep"]
 Skew = Literal["free", "fixed", "auto"]
 
@@ -64,11 +64,6 @@ METHODS = get_args(Method)
 TRAINERS = get_args(Trainer)
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = get_args(Outliers)
-SKEWS = get_args(Skew)
-_CHOICES = {
-    "method": METHODS, "trainer": TRAINERS, "distortion": DISTORTIONS, "outliers": OUTLIERS,
-    "target": TARGETS,
-}  # fmt: skip
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
@@ -169,7 +164,6 @@ def calibrate(
     InputError, DegenerateGeometryError
         The points do not determine the camera; the message says why.
     """
-    check_kind("points", points, Correspondences, "what read_points or Correspondences.from_detections made")
     if points.image is not None:
         from neurocal_cli.calibration.arranged_boards import arranged
 
@@ -190,10 +184,9 @@ def calibrate(
     if known_target is not None and known_target.bends is not None:  # cameras of a rig share the same one
         known_target = replace(known_target, bends=None)
     choice = "given" if isinstance(target, Target) else target
-    _check_options(
-        starts, seed, preferred,
-        method=method, trainer=trainer, distortion=distortion, outliers=outliers, target=choice,
-    )  # fmt: skip
+    if starts < 2:
+        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
+    check_seed(seed)
     needing = {
         "fix": fix, "start": start, "square_pixels": square_pixels, "skew auto": skew == "auto",
         f"target {choice}": choice in ("flat", "free"),
@@ -271,8 +264,6 @@ def _true_cause(points: Correspondences, type: int) -> str:
 
 def _angle_of(skew: bool | str, square_pixels: bool, distortion: str, fix: Mapping[str, float] | None) -> str:
     """Whether the angle of the axes is "free", "fixed", or found to be one of them ("auto")."""
-    if skew not in (True, False, *SKEWS):
-        raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
     if not square_pixels:
         angle = "auto" if skew == "auto" else "free" if skew in (True, "free") else "fixed"
         if fix and "alpha_v" in fix and angle != "fixed":
@@ -399,13 +390,3 @@ def _refuse_misfit(calibration: Calibration) -> None:
         f"no camera fits these points: the error of the best one is {calibration.rmse_px:.3g} px rms; "
         f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
     )
-
-
-def _check_options(starts: int, seed: int, preferred: str, **chosen: str) -> None:
-    for name, value in chosen.items():
-        check_choice(name, value, _CHOICES[name])
-    if not isinstance(starts, (int, np.integer)) or starts < 2:
-        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
-    check_seed(seed)
-    if preferred:
-        check_choice("preferred", preferred, tuple(MODELS))

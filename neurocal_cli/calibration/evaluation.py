@@ -35,7 +35,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose, in_cameras
-from neurocal_cli.errors import InputError, check_kind
+from neurocal_cli.errors import InputError
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
@@ -102,8 +102,6 @@ def evaluate_camera(
     DegenerateGeometryError
         The points of a new view do not determine its pose.
     """
-    if points is not None:
-        check_kind("points", points, Correspondences, "what read_points made")
     given, seed, renamed = points, 0, tuple[str, ...]()
     poses: dict[str, Pose] = {}
     warnings: list[str] = []

@@ -44,7 +44,7 @@ from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import MEDIAN, places_of_views, rms, squared_whitened
 from neurocal_cli.calibration.verdict.findings import DETERMINE
 from neurocal_cli.camera.geometry import Array, median
-from neurocal_cli.errors import DegenerateGeometryError, NeurocalError, check_kind
+from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.network.options import Options
 from neurocal_cli.observations.board import is_flat, planes_of
 from neurocal_cli.observations.points import Correspondences
@@ -151,8 +151,6 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
     If each camera has estimated the target by itself, the common one is the mean of both estimates. Bends of
     single views are left out, because only one of the cameras may have estimated them.
     """
-    for camera in (left, right):
-        check_kind("a camera", camera, Calibration, "what calibrate made of its points")
     if left.target is right.target and (left.target is None or left.target.bends is None):
         return left, right
     first, second = left.target or right.target, right.target or left.target

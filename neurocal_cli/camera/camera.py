@@ -17,13 +17,13 @@ from neurocal_cli.camera import projection
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.given_values import checked_size, real_rows
+from neurocal_cli.camera.given_values import checked_size, real_array, real_rows
 from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, UsageError
 
 
-@frozen_dataclass(eq=False)
+@frozen_dataclass
 class Camera:
     """A camera without a pose.
 
@@ -60,11 +60,6 @@ class Camera:
     name: str = "camera"
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.intrinsics, Intrinsics) and isinstance(self.distortion, Distortion)):
-            raise InputError(
-                "a camera needs Intrinsics, which Intrinsics.from_matrix makes of a 3 x 3 matrix, and a "
-                "Distortion, such as Distortion('k1', [-0.2])"
-            )
         if self.image_size is not None:
             object.__setattr__(self, "image_size", checked_size(self.image_size))
 
@@ -132,7 +127,7 @@ class Camera:
             By A11, A12, A22, A13, A23 and the coefficients of the distortion.
         by_point : (N, 2, 3) array
         """
-        points = np.asarray(points, dtype=float)
+        points = real_rows("points", points, 3)
         k = self.distortion.coefficients
         J = np.zeros((8 + len(k), 2, len(points)))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -210,9 +205,9 @@ class Camera:
         InputError
             A scale is not positive.
         """
-        factors = np.array(np.broadcast_to(scale, 2), dtype=float)
-        if not (np.isfinite(factors).all() and (factors > 0).all()):
-            raise InputError(f"the scale of an image must be positive, found {scale}")
+        factors = np.ones(2) * real_array("scale", scale)
+        if factors.shape != (2,) or not (np.isfinite(factors) & (factors > 0)).all():
+            raise InputError(f"the scale of an image must be positive, one or two numbers, found {scale}")
         A = self.A.copy()
         A[:2] *= factors[:, None]
         A[:2, 2] += 0.5 * (factors - 1)

@@ -20,7 +20,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.polynomial import Coefficients, Distorted, distorted, distorted_with_jacobian
-from neurocal_cli.errors import InputError, check_kind
+from neurocal_cli.errors import InputError
 
 Model = Literal[
     "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted",
@@ -59,7 +59,6 @@ _PINHOLES = {
 
 def coefficient_names(model: str) -> tuple[str, ...]:
     """Names of a model's coefficients, in order; an InputError for an unknown model."""
-    check_kind("a distortion model", model, str, f"one of {', '.join(MODELS)}")
     if model in BY_DIRECTION:
         return BY_DIRECTION[model]
     if model not in MODELS:
@@ -73,7 +72,7 @@ def radial_part(model: str, k: Sequence[float] | Array) -> list[float]:
     return [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
 
 
-@frozen_dataclass(eq=False)
+@frozen_dataclass
 class Distortion:
     """A distortion model, one of `MODELS`, with its coefficients; the default is no distortion.
 

@@ -24,6 +24,7 @@ else:
 
 
 T = TypeVar("T")
+_LARGE = 20  # elements of an array of which the shape tells more
 
 
 @overload
@@ -99,8 +100,13 @@ def _init(cls: Any) -> Callable[..., None]:
 
 @recursive_repr()
 def _repr(self: Any) -> str:
-    shown = ", ".join(f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if f.repr)
+    shown = ", ".join(f"{f.name}={_shown(getattr(self, f.name))}" for f in fields(self) if f.repr)
     return f"{type(self).__qualname__}({shown})"
+
+
+def _shown(value: Any) -> str:
+    """A value, but of a large array its shape."""
+    return f"<array {value.shape}>" if getattr(value, "size", 0) > _LARGE else repr(value)
 
 
 def _eq(self: Any, other: object) -> bool:
@@ -112,7 +118,12 @@ def _hash(self: Any) -> int:
 
 
 def _compared(value: Any) -> tuple[Any, ...]:
-    return tuple([getattr(value, name) for name in _compared_fields(value.__class__)])
+    return tuple([_plain(getattr(value, name)) for name in _compared_fields(value.__class__)])
+
+
+def _plain(value: Any) -> Any:
+    """An array as a tuple, which can be compared and hashed; all else as it is."""
+    return (value.shape, *value.ravel().tolist()) if hasattr(value, "ravel") else value
 
 
 @cache

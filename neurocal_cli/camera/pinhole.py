@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler
-from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.given_values import real_array, real_rows
 from neurocal_cli.errors import InputError
 
 INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
@@ -118,7 +118,7 @@ class Intrinsics:
         return J
 
 
-@frozen_dataclass(eq=False)
+@frozen_dataclass
 class Pose:
     """World to camera, ``Xc = R M + t``.
 
@@ -171,7 +171,7 @@ class Pose:
 
     def to_camera(self, world: Array) -> Array:
         """World points (..., 3) in the camera's frame."""
-        return np.asarray(world @ self.R.T + self.t)
+        return np.asarray(real_rows("world", world, 3, stacked=True) @ self.R.T + self.t)
 
     @property
     def euler(self) -> Array:

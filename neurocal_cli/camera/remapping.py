@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array, Shape
 from neurocal_cli.camera.undistortion import Undistorted, chosen_view, sources
-from neurocal_cli.errors import InputError, check_kind
+from neurocal_cli.errors import InputError
 
 Interpolation = Literal["nearest", "linear", "cubic", "lanczos"]
 INTERPOLATIONS = {
@@ -142,8 +142,6 @@ def undistort_image(
     InputError
         An image of another size than the camera's, or an array of another type or shape.
     """
-    if interpolation not in INTERPOLATIONS:
-        raise InputError(f"interpolation must be one of {', '.join(INTERPOLATIONS)}, not {interpolation!r}")
     camera = camera_of(camera)
     size = camera.image_size or _size(image)
     return Remapping(camera, chosen_view(camera, alpha, to, fov, size), size, interpolation)(image)
@@ -151,7 +149,6 @@ def undistort_image(
 
 def _size(image: NDArray[Any]) -> tuple[int, int]:
     """Width and height [px] of an image that OpenCV can interpolate."""
-    check_kind("an image", image, np.ndarray, "what read_image or cv2.imread made")
     flat = image.ndim == 2 or (image.ndim == 3 and 1 <= image.shape[2] <= _CHANNELS)
     if not flat or not image.size or image.dtype not in _TYPES:
         raise InputError(

@@ -21,7 +21,6 @@ from neurocal_cli.detection.identify import Identified, Located, identify
 from neurocal_cli.detection.markers.locate import check_measured_spacing, locate
 from neurocal_cli.detection.measuring import Points, linearised, measure
 from neurocal_cli.detection.placement import NoBoardError
-from neurocal_cli.errors import check_kind
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 
@@ -132,7 +131,6 @@ def detect_points(
     InputError
         The image has another shape or type, or pixels that are not finite.
     """
-    check_kind("board", board, Board, "one such as Board.single(9, 6, 25.0)")
     image = grey_image(image)
     if is_inverted(board):
         # The response is that of the light, not of its negative.

@@ -27,7 +27,7 @@ from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.errors import FormatError, InputError, check_kind, value_failures
+from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
 from neurocal_cli.files.camera_tree import read_tree
 from neurocal_cli.files.exchange.reading import read_intrinsics
@@ -54,7 +54,6 @@ def format_lens(lens: ZoomLens) -> str:
 
 def write_lens(lens: ZoomLens, path: str | Path) -> None:
     """Write a lens file, whole or not at all; ``-`` is stdout."""
-    check_kind("lens", lens, ZoomLens, "what fit_lens or read_lens made")
     write_whole(path, format_lens(lens))
 
 

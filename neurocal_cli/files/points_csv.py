@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError, check_kind, value_failures
+from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.table import Table, read_table
 from neurocal_cli.files.table_header import Schema, quoted_field
 from neurocal_cli.files.writing import write_whole
@@ -111,7 +111,6 @@ def ids_at_two_places(points: Correspondences) -> list[str]:
 
 def write_points(points: Correspondences, path: str | Path) -> None:
     """Write points as CSV; `read_points` gives back the same numbers to the last bit."""
-    check_kind("points", points, Correspondences, "what read_points or Correspondences made")
     write_whole(path, format_points(points))
 
 

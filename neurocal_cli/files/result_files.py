@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.presented import Presented
-from neurocal_cli.errors import check_kind
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.writing import write_whole
 
@@ -48,7 +46,6 @@ def write_result(
     poses and the record of the network. `alpha` is that of a rig's rectification, see `rectify`. Returns what
     the file cannot represent exactly, such as skew in XML.
     """
-    check_kind("result", result, Presented, "what calibrate or calibrate_rig made, then the path")
     if lean:
         result = result.lean
     ending = os.path.splitext(str(path))[1].lower()

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import UNDISTORTED, Array
 from neurocal_cli.camera.given_values import checked_size, real_array, real_rows
-from neurocal_cli.errors import InputError, check_kind
+from neurocal_cli.errors import InputError
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.labels import factorise, first_repeat
 
@@ -228,7 +228,6 @@ class Correspondences:
         InputError
             There is no image, or image sizes differ, so the images come from more than one camera.
         """
-        check_kind("detections", detections, Mapping, "a dict of Detection by the name of the image")
         if not detections:
             raise InputError("there are no images with points; give at least one")
         names, found = list(detections), list(detections.values())
@@ -312,7 +311,7 @@ class Correspondences:
             return self
         return self.select(np.isin(self.view_index, np.linspace(0, self.n_views - 1, most).round()))
 
-    def select(self, rows: NDArray[Any] | slice) -> Correspondences:
+    def select(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Correspondences:
         """The same data restricted to some rows (a mask, indices or a slice)."""
 
         def pick(values: Any) -> Any:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from neurocal_cli.observations.distances import NO_SCALE, Distance, Scale, fitte
 from neurocal_cli.observations.points import Correspondences
 
 TargetChoice = Literal["auto", "given", "flat", "free"]
-TARGETS = get_args(TargetChoice)
 
 _OFF = 0.2  # squares; greatest distance of given points from a chessboard's places
 _DIGITS = 9  # of what is written of a plane

@@ -57,7 +57,6 @@ def test_what_each_type_leaves_free(
         (2, {"extrinsics": {}}, "extrinsics needs type 4"),
         (3, {}, "type 3 needs the intrinsics"),
         (4, {}, "type 4 needs the extrinsics"),
-        (4, {"extrinsics": CAMERA}, "the extrinsics must be a dict with a Pose for each view"),
     ],
 )
 def test_what_does_not_go_with_a_type_is_wrong_usage(type: Any, given: dict[str, Any], words: str) -> None:

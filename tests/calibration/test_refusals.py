@@ -322,7 +322,6 @@ def test_one_point_of_thousands_behind_the_camera_is_noticed(seed: int) -> None:
         ({"preferred": "round"}, "preferred must be one of none, k1"),
         ({"backprop": BackpropOptions()}, "backprop needs the trainer backprop, but the trainer is lm"),
         ({"type": 7}, "type must be 1, 2, 3 or 4"),
-        ({"type": 4, "extrinsics": {"view": (np.eye(3), np.zeros(3))}}, "a Pose for each view"),
         ({"type": 2}, "type 2 needs the image centre"),
         ({"type": 3}, "type 3 needs the intrinsics"),
     ],
@@ -336,6 +335,11 @@ def test_unknown_options_are_wrong_usage(options: dict[str, Any], words: str) ->
     [
         ({"type": 2, "image_center": "ab"}, "two finite numbers"),
         ({"type": 2, "image_center": (np.nan, 0.0)}, "two finite numbers"),
+        (
+            {"type": 4, "extrinsics": {"view": (np.eye(3), np.zeros(3))}},
+            "a dict with a Pose for each name",
+        ),
+        ({"type": 4, "extrinsics": Intrinsics(1, 1, 0, 0)}, "a dict with a Pose for each name"),
         ({"type": 4, "extrinsics": {}}, "no view named 'view'; they have none"),
         ({"type": 3, "intrinsics": np.zeros((3, 3))}, "camera matrix"),
     ],

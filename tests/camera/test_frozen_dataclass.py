@@ -10,9 +10,13 @@ from dataclasses import FrozenInstanceError, asdict, astuple, dataclass, field, 
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 
 Decorator = Callable[[type], Any]
 
@@ -169,6 +173,14 @@ def test_a_default_stands_behind_the_fields_without_one() -> None:
         class Disordered:
             first: int = 1
             second: int
+
+
+def test_arrays_are_compared_and_hashed_by_their_values() -> None:
+    poses = [Pose(np.eye(3), np.array([0.0, 0.0, z])) for z in (1, 1, 2)]
+    cameras = [Camera(Intrinsics(1, 1, 0, 0), Distortion("k1", [k])) for k in (0.1, 0.1, 0.2)]
+    for first, same, other in (poses, cameras):
+        assert first == same
+        assert len({first, same, other}) == 2
 
 
 def test_objects_are_pickled() -> None:

@@ -23,7 +23,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.undistortion import new_matrix, sources, undistort_pixels, undistorted_camera
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, UsageError
 
 SIZE = (640, 480)
 BENDING = [model for model in LENSES if model != "none"]
@@ -309,7 +309,7 @@ def test_large_images_are_done_in_parts() -> None:
 def test_an_image_of_another_size_is_refused() -> None:
     with pytest.raises(InputError, match=r"has 100 x 50 px, but the camera is for 640 x 480"):
         undistort_image(np.zeros((50, 100), np.uint8), camera("k1"))
-    with pytest.raises(InputError, match="interpolation must be one of"):
+    with pytest.raises(UsageError, match="interpolation must be one of"):
         undistort_image(smooth(), camera("k1"), interpolation="best")
 
 

@@ -350,7 +350,8 @@ def test_the_options_are_those_of_the_library() -> None:
 
     import click
 
-    from neurocal_cli.calibration.zoom.fit import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
+    from neurocal_cli.calibration.calibrate import OUTLIERS
+    from neurocal_cli.calibration.zoom.fit import CAMERAS, DISTORTIONS, TRAININGS
     from neurocal_cli.commands.lens import fit
 
     library = inspect.signature(fit_lens).parameters

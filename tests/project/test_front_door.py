@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import ast
+import pickle
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib import import_module
-from inspect import signature
+from inspect import isclass, isfunction, ismethod, signature
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 
 import neurocal
@@ -18,6 +22,7 @@ from neurocal_cli.calibration.calibrate import DISTORTIONS, CameraOptions, Lens,
 from neurocal_cli.calibration.presented import Program
 from neurocal_cli.camera.distortion import MODELS, Model
 from neurocal_cli.camera.remapping import INTERPOLATIONS, Interpolation
+from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.files.exchange.reading import FORMATS
 
 ROOT = Path(neurocal_cli.__file__).parent
@@ -62,6 +67,72 @@ def test_the_types_of_options_list_what_there_is() -> None:
 def test_options_of_rigs_are_those_of_a_camera() -> None:
     own = {"points", "camera_name", "progress", "start"}
     assert set(CameraOptions.__annotations__) == set(signature(calibrate).parameters) - own
+
+
+# Annotations of what may be an array, whose functions say what is wrong with it.
+ARRAYS = re.compile(r"ArrayLike|\| Array|tuple\[(int|float), |np.generic|\bAny$|Unpack")
+
+
+def test_every_public_function_refuses_arguments_of_another_kind() -> None:
+    count = 0
+    for public in map(neurocal.__getattr__, neurocal_cli.__all__):
+        names = ["", *(n for n in dir(public) if n == "__init__" or n[0] != "_")] if isclass(public) else [""]
+        for function in [getattr(public, name) if name else public for name in names]:
+            if not isfunction(function) and not ismethod(function):
+                continue
+            for parameter in signature(function).parameters.values():
+                if parameter.name == "self" or ARRAYS.search(parameter.annotation):
+                    continue
+                count += 1
+                with pytest.raises(NeurocalError, match=parameter.name):
+                    function(**{parameter.name: object()})
+    assert count > 350
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: neurocal.read_points(None), InputError, "paths must be a text or a path or a list"),
+        (lambda: neurocal.read_board(True), InputError, "path must be a text or a path, not bool"),
+        (lambda: neurocal.Board.single("9", 6, 25), UsageError, "cols must be a whole number, not '9'"),
+        (
+            lambda: neurocal.find_drift([1], 2),
+            InputError,
+            "old must be a Calibration or a Camera, not list of",
+        ),
+        (lambda: neurocal.fit_lens(None), InputError, "LensPoints, not NoneType; give what read_lens_points"),
+        (lambda: neurocal.fit_lens(None, camera="fixed"), InputError, "points must be"),
+        (
+            lambda: neurocal.read_points("x.csv", notes=()),
+            InputError,
+            "notes must be a list, each a text, not",
+        ),
+        (lambda: neurocal.calibrate_rig({"a": 1}), InputError, "a dict with a Correspondences for each name"),
+        (
+            lambda: neurocal.calibrate(None, distortion="brown"),
+            InputError,
+            "points must be a Correspondences",
+        ),
+        (lambda: neurocal.calibrate(progress=3), InputError, "progress must be a function, not int"),
+        (lambda: neurocal.plot(panel=3, kind="gif"), InputError, "panel must be a text, not int"),
+        (lambda: neurocal.plot(kind="gif"), UsageError, "kind must be one of png, svg, pdf, not 'gif'"),
+        (lambda: neurocal.Camera(np.eye(3)), InputError, "give what Intrinsics.from_matrix makes of a 3 x 3"),
+    ],
+)
+def test_it_says_what_to_give(call: Callable[[], object], error: type[NeurocalError], words: str) -> None:
+    with pytest.raises(error, match=re.escape(words)):
+        call()
+
+
+def test_lists_and_numbers_of_numpy_are_taken() -> None:
+    pose = neurocal.Pose([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [1, 2, 3])
+    assert pose.to_camera([[1, 1, 1]]).tolist() == [[2, 3, 4]]
+    board = neurocal.Board.single(np.int64(9), np.float32(6), np.array(25))
+    assert board == neurocal.Board.single(9, 6, 25.0)
+
+
+def test_public_functions_are_pickled() -> None:
+    assert pickle.loads(pickle.dumps(neurocal.calibrate)) is neurocal.calibrate
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.target_choice import can_tell, common_target, on_one_target
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import InputError, UsageError, check_kind, plural
+from neurocal_cli.errors import InputError, UsageError, plural
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, TargetChoice
@@ -47,11 +47,8 @@ def _options_of_each(
     options: CameraOptions,
 ) -> dict[str, dict[str, Any]]:
     """The options of each camera, by its name, after all arguments of `calibrate_rig` are checked."""
-    check_kind("points", points, Mapping, "a dict of the points of each camera by its name")
     if len(points) < 2:
         raise UsageError(f"a rig has two cameras or more, not {len(points)}; give the points of each camera")
-    for name, one in points.items():
-        check_kind(f"points of {name}", one, Correspondences, "what read_points made")
     if stray := sorted(set(extra) - set(points)):
         raise UsageError(f"there are options for a camera {stray[0]!r}, but no points; give its points")
     of_each: dict[str, dict[str, Any]] = {name: {**options, **extra.get(name, {})} for name in points}

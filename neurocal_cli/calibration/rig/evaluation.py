@@ -39,7 +39,7 @@ from neurocal_cli.calibration.verdict.odd_points import units_mixed
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median, rotation_vector
 from neurocal_cli.camera.pinhole import Pose, in_cameras
-from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError, check_kind
+from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
@@ -228,7 +228,6 @@ def evaluate_stereo_rig(
     InputError
         There are no points, or the two cameras have none in common.
     """
-    check_kind("rig", rig, StereoRig, "what calibrate_stereo made, or Rig.pair")
     if points is None and not (len(rig.left.points) and len(rig.right.points)):
         raise InputError("the rig has no points of its own; give the points to evaluate it on")
     return _Evaluator((rig.left, rig.right), rig, points, method).evaluation()

@@ -92,7 +92,7 @@ def triangulate_many(
     if poses is None or set(poses) != set(cameras):
         raise InputError("the poses are not those of the cameras; give the pose of each camera")
     names = list(cameras)
-    labels = np.asarray(camera, dtype=str)
+    labels = np.asarray(camera, dtype=str).ravel()
     rows = np.full(len(labels), -1, dtype=np.intp)
     for k, name in enumerate(names):
         rows[labels == name] = k

@@ -24,7 +24,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.undistortion import plane_like
-from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError, check_kind
+from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.undistorted_points import map_points, shown
 
@@ -54,7 +54,6 @@ def rectify(rig: StereoRig, alpha: float | None = None) -> Rectification | None:
     pixels of the original images, and values in between interpolate. With None nothing is scaled. The
     focal length is negative, as OpenCV's, where the optical axes differ so much that no scale does this.
     """
-    check_kind("rig", rig, StereoRig, "what calibrate_stereo made, or Rig.pair")
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")
     size = _size(rig)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from typing import Any
 
@@ -22,7 +22,7 @@ from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.measured import PlaneErrors
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
-from neurocal_cli.errors import InputError, check_kind
+from neurocal_cli.errors import InputError
 
 _LEAST_NOISE = 0.1  # of a camera's pixels over that of all; fewer points may fit better by chance
 
@@ -298,7 +298,7 @@ class Rig(FixedCameras):
                 timed=self.timed,
                 rmse_px=self.rmse_px,
                 warnings=self.warnings,
-                judgement=None if self.judgement is None else (lambda _: self.verdict),
+                judgement=_judged_as(self),
             )
         counts = [len(camera.points) for camera in cameras]
         squares = sum(n * float(c.rmse_px) ** 2 for n, c in zip(counts, cameras, strict=True) if n)
@@ -350,9 +350,17 @@ def named_std(covariance: Array, t: Array) -> dict[str, float]:
 
 
 def any_rig(rig: Rig | StereoRig) -> Rig:
-    """Any rig as one of named cameras; an InputError for anything else."""
-    check_kind("rig", rig, (Rig, StereoRig), "what calibrate_rig or calibrate_stereo made")
+    """Any rig as one of named cameras."""
     return of_two(rig) if isinstance(rig, StereoRig) else rig
+
+
+def _judged_as(rig: FixedCameras) -> Callable[[Any], Verdict | None] | None:
+    """The verdict of a rig in its other form, which can be pickled."""
+    return None if rig.judgement is None else partial(_verdict_of, rig)
+
+
+def _verdict_of(rig: FixedCameras, _: object) -> Verdict | None:
+    return rig.verdict
 
 
 def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:
@@ -376,5 +384,5 @@ def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:
         stop_reason=rig.stop_reason,
         iterations=rig.iterations,
         warnings=rig.warnings,
-        judgement=None if rig.judgement is None else (lambda _: rig.verdict),
+        judgement=_judged_as(rig),
     )

@@ -21,7 +21,7 @@ from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import DegenerateGeometryError, InputError, check_kind
+from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
@@ -72,12 +72,11 @@ def evaluate_rig(rig: Rig, points: Mapping[str, Correspondences] | None = None) 
     InputError
         There are no points, a camera that the rig does not have, or no frame of several cameras.
     """
-    check_kind("rig", rig, Rig, "what calibrate_rig made; evaluate_stereo_rig is for a StereoRig")
     given = points is not None
     if points is None:
         points = {name: camera.points for name, camera in rig.cameras.items() if len(camera.points)}
-        if not points:
-            raise InputError("the rig has no points of its own; give the points to evaluate it on")
+    if not points:
+        raise InputError("the rig has no points of its own; give the points to evaluate it on")
     for name, one in points.items():
         if name not in rig.cameras:
             raise InputError(f"the rig has no camera {name!r}; its cameras are {', '.join(rig.cameras)}")

@@ -25,7 +25,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.given_values import real_array, real_rows
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import InputError, check_choice
+from neurocal_cli.errors import InputError
 
 Method = Literal["optimal", "linear", "midpoint"]
 METHODS = get_args(Method)
@@ -131,7 +131,6 @@ def triangulate(
     InputError
         Arrays of different lengths or wrong shapes, a rig that is no Pose, or noise that is not positive.
     """
-    check_choice("method", method, METHODS)
     if isinstance(left, StereoRig):
         noise, left_pixels, right_pixels = left.noise_shares if noise is None else noise, right, pose
         left, right, pose = left.left, left.right, left.pose
@@ -147,7 +146,7 @@ def triangulate(
     pixels = pixels[0] / sigma[0], pixels[1] / sigma[1]
     cameras = in_noise(camera_of(left), float(sigma[0])), in_noise(camera_of(right), float(sigma[1]))
     poses = [pose] if isinstance(pose, Pose) else pose
-    if not all(isinstance(one, Pose) for one in poses):
+    if not (isinstance(poses, (list, tuple)) and poses and all(isinstance(one, Pose) for one in poses)):
         raise InputError("the rig must be a Pose, such as Pose(R, t), or a sequence of them")
     rigs = np.stack([one.D for one in poses])
     if len(rigs) == 1:

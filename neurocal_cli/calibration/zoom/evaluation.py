@@ -39,7 +39,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.errors import InputError, NeurocalError, check_kind
+from neurocal_cli.errors import InputError, NeurocalError
 
 _HIGHEST_DEGREE = 6
 
@@ -80,8 +80,6 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
     InputError
         Points without the controls of the lens, or of another image size.
     """
-    check_kind("lens", lens, ZoomLens, "what fit_lens or read_lens made")
-    check_kind("points", points, LensPoints, "what read_lens_points made")
     points, warnings = _matched(lens, on_target(points, lens.target))
     x = lens.scaled(points.settings)
     prediction = lens.predict(points.settings)

@@ -10,10 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from typing import Literal, get_args
 
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import Quadratics
+from neurocal_cli.calibration.calibrate import Outliers
 from neurocal_cli.calibration.zoom.initialisation import (
     CalibratedSettings,
     FitOptions,
@@ -57,13 +59,13 @@ from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, WITH_PRISM
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import DegenerateGeometryError, InputError, check_choice, check_kind, check_seed
+from neurocal_cli.errors import DegenerateGeometryError, InputError, check_choice, check_seed
 from neurocal_cli.network.options import Progress
-from neurocal_cli.observations.target import TARGETS
+from neurocal_cli.observations.target import TargetChoice
 
-TRAININGS = ("joint", "alternating")
-OUTLIERS = ("reject", "keep")
-CAMERAS = ("auto", "still", "moving")
+Training = Literal["joint", "alternating"]
+CameraKind = Literal["auto", "still", "moving"]
+TRAININGS, CAMERAS = get_args(Training), get_args(CameraKind)
 # A network follows each coefficient; of the wide models a fisheye alone has coefficients that are linear.
 _TOO_MANY = {*WIDE, *WITH_PRISM} - {"fisheye"}
 DISTORTIONS = ("auto", *(model for model in MODELS if model not in _TOO_MANY))
@@ -75,13 +77,13 @@ _TOGETHER = 2  # most settings that are left out at once, as those whose names a
 def fit_lens(
     points: LensPoints,
     distortion: str = "auto",
-    training: str = "joint",
-    outliers: str = "reject",
-    camera: str = "auto",
+    training: Training = "joint",
+    outliers: Outliers = "reject",
+    camera: CameraKind = "auto",
     skew: bool = True,
     seed: int = 0,
     *,
-    target: str = "auto",
+    target: TargetChoice = "auto",
     topologies: tuple[tuple[int, int], ...] | None = None,
     progress: Progress | None = None,
 ) -> ZoomLens:
@@ -124,12 +126,7 @@ def fit_lens(
         The points do not determine a zoom lens; the message says why.
     """
     check_choice("distortion", distortion, DISTORTIONS)
-    check_choice("training", training, TRAININGS)
-    check_choice("outliers", outliers, OUTLIERS)
-    check_choice("camera", camera, CAMERAS)
-    check_choice("target", target, TARGETS)
     check_seed(seed)
-    check_kind("points", points, LensPoints, "what read_lens_points made")
     report = progress or (lambda stage, share: None)
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
@@ -242,7 +239,7 @@ class LensCameras:
     @classmethod
     def of(
         cls,
-        columns: Mapping[str, Array],
+        columns: Mapping[str, Array | None],
         image_size: tuple[int, int] | None = None,
         unit: str = "mm",
         source: str = "cameras",
@@ -298,7 +295,6 @@ def fit_lens_cameras(
         A negative seed.
     """
     check_seed(seed)
-    check_kind("cameras", cameras, LensCameras, "what LensCameras.of or read_lens_data made")
     report = progress or (lambda stage, share: None)
     distinct = len(np.unique(cameras.settings, axis=0))
     check_settings(distinct, len(cameras.controls), cameras.source)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.observability import MEANINGLESS
-from neurocal_cli.calibration.calibration import Calibration, ViewResult
+from neurocal_cli.calibration.calibration import Calibration, Verdict, ViewResult
 from neurocal_cli.calibration.presented import Summarised
 from neurocal_cli.calibration.zoom.parameter_networks import LensNets, are_cameras
 from neurocal_cli.calibration.zoom.settings import (
@@ -24,8 +24,10 @@ from neurocal_cli.calibration.zoom.settings import (
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_jacobian, nearest_rotation
+from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
-from neurocal_cli.errors import InputError, UsageError, check_kind
+from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
@@ -110,6 +112,12 @@ class ZoomLens(Summarised):
 
     _summary = ("commands.show.zoom_report", "lens_report")
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Verdict on this lens, computed when it is first read."""
+        found: Verdict = late("calibration.zoom.judgement", "judge_lens")(self)
+        return found
+
     def __repr__(self) -> str:
         ranges = (
             f"{name} {low:g} to {high:g}"
@@ -173,6 +181,7 @@ class ZoomLens(Summarised):
         InputError
             A setting outside the calibrated range, or not finite.
         """
+        values = dict.fromkeys(self.controls) | values
         for name, value in values.items():
             if (value is None) == (name in self.controls):
                 has = " and ".join(self.controls)
@@ -198,10 +207,7 @@ class ZoomLens(Summarised):
 
     def _numbers(self, settings: Array, dimensions: int) -> Array:
         """One setting or several as an array of one or two dimensions."""
-        try:
-            found = np.asarray(settings, dtype=float)
-        except (TypeError, ValueError):
-            found = np.zeros(0)
+        found = real_array("the setting", settings)
         D = len(self.controls)
         if found.ndim != dimensions or found.shape[-1] != D:
             raise InputError(
@@ -333,7 +339,6 @@ def camera_at(
         The setting is not one finite number for each control, or outside the calibrated range; or the
         networks determine no camera there.
     """
-    check_kind("lens", lens, ZoomLens, "what fit_lens or read_lens made")
     setting, outside = lens.check_setting(setting, extrapolate)
     prediction = lens.predict(setting[None])
     values, std = prediction.local[0], prediction.std[0]

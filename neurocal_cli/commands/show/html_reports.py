@@ -12,7 +12,6 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import predict
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
-from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import in_plane
@@ -144,7 +143,7 @@ def _lens_page(lens: ZoomLens, origin: Origin) -> str:
     head, lines = lens_words(lens)
     parts = [
         f'<p class="soft">{escape(head)}</p>',
-        verdict_block(judge_lens(lens)),
+        verdict_block(lens.verdict),
         section("Networks", table(network_rows(lens)), _listed(lines)),
         section("Uncertainty over the settings", f'<div class="figures">{_over_settings(lens)}</div>'),
         section("How to repeat it", _origin(command, origin, {})),

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING
+from typing import Literal
 
 from neurocal_cli.calibration.advice import advise
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.show.camera_report import parameter_rows
@@ -17,13 +16,9 @@ from neurocal_cli.commands.show.html_page import table, verdict_block
 from neurocal_cli.commands.show.rig_report import pose_rows, rig_rows, side_rows
 from neurocal_cli.commands.show.text import Table
 from neurocal_cli.commands.show.zoom_report import draw_lens, network_rows
-from neurocal_cli.errors import InputError, UsageError, check_choice, check_kind
+from neurocal_cli.errors import InputError, UsageError, check_choice
 
-if TYPE_CHECKING:
-    from neurocal_cli.commands.show.html_reports import Result
-
-_RESULTS, _MADE = (Calibration, StereoRig, Rig, ZoomLens), "what calibrate, calibrate_rig or fit_lens made"
-_KINDS = ("png", "svg", "pdf")
+Result = Calibration | StereoRig | Rig | ZoomLens
 
 
 class Picture(bytes):
@@ -57,13 +52,12 @@ def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> st
     from neurocal_cli.commands.show.html_page import Origin, versions
     from neurocal_cli.commands.show.html_reports import page_of
 
-    check_kind("result", result, _RESULTS, _MADE)
     if photographs and not isinstance(result, Calibration):
         raise UsageError("only the page of a Calibration shows photographs; leave them out")
     return page_of(result, Origin({}, versions=versions()), [photographs] if photographs else ())
 
 
-def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture:
+def plot(result: Result, panel: str | None = None, kind: Literal["png", "svg", "pdf"] = "png") -> Picture:
     """Draw the picture of the option ``--plot``.
 
     Parameters
@@ -86,8 +80,6 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
     NeurocalError
         matplotlib is not installed.
     """
-    check_kind("result", result, _RESULTS, _MADE)
-    check_choice("kind", kind, _KINDS)
     if isinstance(result, Calibration) and panel == "next":
         from neurocal_cli.commands.show.advice import draw_advice
 
@@ -120,6 +112,5 @@ def notebook_html(result: Calibration | StereoRig | Rig | ZoomLens) -> str:
         tables = side_rows(result), rig_rows(result)
     else:
         tables = (network_rows(result),) if isinstance(result, ZoomLens) else pose_rows(result)
-    verdict = judge_lens(result) if isinstance(result, ZoomLens) else result.verdict
     head = f"<p>{escape(repr(result).splitlines()[0])}</p>"
-    return "".join([head, verdict_block(verdict), *map(table, tables)])
+    return "".join([head, verdict_block(result.verdict), *map(table, tables)])

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.zoom.evaluation import LensEvaluation
 from neurocal_cli.calibration.zoom.initialisation import local_covariance
-from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.settings import CONTROLS
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
@@ -57,7 +56,7 @@ _PANEL = (3.4, 2.8)  # inches
 def lens_report(lens: ZoomLens) -> str:
     """Summary of a lens: its data, its networks, its errors and the verdict."""
     head, tail = lens_words(lens)
-    return joined([head], align(network_rows(lens)), tail, verdict_lines(judge_lens(lens)))
+    return joined([head], align(network_rows(lens)), tail, verdict_lines(lens.verdict))
 
 
 def lens_words(lens: ZoomLens) -> tuple[str, list[str]]:
@@ -119,7 +118,7 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
         "members": len(lens.members),
         "target": target_json(lens.target, lens.unit),
         **attributes(lens, "converged warnings"),
-        **verdict_json(judge_lens(lens)),
+        **verdict_json(lens.verdict),
     }
 
 

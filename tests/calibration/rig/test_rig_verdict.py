@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -150,6 +151,7 @@ def test_the_sample_rig_is_good() -> None:
     rig = calibrate_stereo(*(read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right")))
     assert rig.verdict is not None
     assert (rig.verdict.word, rig.verdict.reasons) == ("good", ())
+    assert pickle.loads(pickle.dumps(rig)).verdict == rig.verdict
 
 
 @pytest.mark.slow  # detection; tests/commands/test_cli_stereo.py has a quick one

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from support.rigs import KINDS, RigScene, random_rig
 from support.slow_cases import slow_but
 
-from neurocal_cli import Pose, calibrate_stereo
-from neurocal_cli.calibration.rig.triangulation import METHODS, Triangulated, epipolar_limit, triangulate
+from neurocal_cli import Pose, calibrate_stereo, triangulate
+from neurocal_cli.calibration.rig.triangulation import METHODS, Triangulated, epipolar_limit
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError, UsageError

@@ -12,6 +12,7 @@ from simulated_zoom import SimulatedZoom
 from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LOW, between, covered, grid, seen, truth
 
+from neurocal import fit_lens
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.zoom.evaluation import (
     _baseline_error,
@@ -25,7 +26,7 @@ from neurocal_cli.calibration.zoom.evaluation import (
     spline_matrix,
     thin_plate_matrix,
 )
-from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
+from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens_cameras
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
 from neurocal_cli.calibration.zoom.settings import LensPoints
@@ -201,7 +202,9 @@ def test_settings_outside_are_refused_unless_asked_for() -> None:
     assert list(camera.warnings) == warnings
     with pytest.raises(InputError, match=r"does not determine the camera|no valid camera"):
         camera_at(lens, np.array([9000.0, 450.0]), extrapolate=True)
-    for wrong in (1250.0, [], [1250.0], [[1250.0, 400.0]], None, [1250.0, "far"]):
+    with pytest.raises(InputError, match="setting must be an array of real numbers"):
+        camera_at(lens, [1250.0, "far"])  # type: ignore[list-item]
+    for wrong in (1250.0, [], [1250.0], [[1250.0, 400.0]], None):
         with pytest.raises(InputError, match="has 2 controls, zoom and focus; give a list of 2 numbers"):
             camera_at(lens, wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="give rows of 2 numbers"):
