@@ -68,7 +68,9 @@ TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1
 # Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING, _WITH_PRODUCTS = 2.0, 1.5  # most of them, and most if tanh units have products
-_LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
+_LOG_ODDS = (
+    5.0  # log-odds that another scale of alpha_u than the logarithmic one must reach, and tanh units in it
+)
 _AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
 _GRID = 13  # values of each control at which networks are compared
 
@@ -287,7 +289,7 @@ def _best_scale(
     fits = {}
     for scale in SCALES:
         targets, derivative = to_scale(scale, alpha)
-        nets, evidence = _fit(x, targets, variance * derivative**2, rng, budget)
+        nets, evidence = _fit(x, targets, variance * derivative**2, rng, budget, by_optics=True)
         # The density of the targets as one of alpha.
         fits[scale] = (evidence + float(np.log(np.abs(derivative)).sum()), nets)
     best = max(fits, key=lambda name: fits[name][0])
@@ -296,9 +298,18 @@ def _best_scale(
 
 
 def _fit(
-    x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget
+    x: Array,
+    targets: Array,
+    variance: Array,
+    rng: np.random.Generator,
+    budget: Budget,
+    by_optics: bool = False,
 ) -> tuple[list[ParameterNet], float]:
-    """Networks of all topologies and starts, best first; the evidence of the best in units of the targets."""
+    """Networks of all topologies and starts, best first; the evidence of the best in units of the targets.
+
+    Focal lengths follow homographic laws (`mlfn`), so they need no tanh units unless these are decidedly more
+    probable; of known cameras, whose errors are estimated from wiggles, all networks are taken.
+    """
     centre, spread = float(targets.mean()), float(targets.std())
     # Equal targets have no spread; their noise, or 1, replaces it.
     spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
@@ -314,6 +325,9 @@ def _fit(
             nets.append(ParameterNet(topology, w, a, centre, spread, float(tau2) * spread**2))
             evidence.append(float(e))
     order = np.argsort(-np.array(evidence), kind="stable")
+    plain = [k for k in order if nets[k].topology.own + nets[k].topology.hidden == 0]
+    if by_optics and variance.any() and plain and evidence[order[0]] < evidence[plain[0]] + _LOG_ODDS:
+        order = np.array(plain)
     return [nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread))
 
 

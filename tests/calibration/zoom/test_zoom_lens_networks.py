@@ -195,6 +195,27 @@ def test_no_large_unit_passes_through_four_values_and_overshoots() -> None:
     assert np.sqrt((error**2).mean()) < 0.2
 
 
+@pytest.mark.parametrize(("law", "hidden"), [("c", [0, 0]), ("e", [1, 1])])
+def test_focal_lengths_have_tanh_units_only_where_they_are_decidedly_more_probable(
+    law: str, hidden: list[int]
+) -> None:
+    at = grid(5, 3)
+    local = np.column_stack([truth(law, at)[name] for name in ("alpha_u", "alpha_v", "u0", "v0")])
+    noisy = local + 0.7 * np.random.default_rng(0).normal(size=local.shape)
+    budget = Budget(topologies=((0, 0), (0, 1)), starts=6, best=6, members=2, schedule=Schedule(120, 30, 80))
+    found = fit_committee(
+        scaled_controls(at, LOW, HIGH),
+        ("alpha_u", "alpha_v", "u0", "v0"),
+        noisy,
+        np.tile(np.eye(4), (len(at), 1, 1)),
+        0.7**2,
+        np.random.default_rng(0),
+        budget,
+        lambda share: None,
+    )
+    assert [nets.nets[0].topology.hidden for nets in found] == hidden
+
+
 def test_the_outermost_settings_do_not_count_as_left_out() -> None:
     shares = 2 * (grid(4, 4) - LOW) / (HIGH - LOW) - 1
     assert np.flatnonzero(is_inside(shares)).tolist() == [5, 6, 9, 10]
