@@ -68,9 +68,8 @@ TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1
 # Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING, _WITH_PRODUCTS = 2.0, 1.5  # most of them, and most if tanh units have products
-_LOG_ODDS = (
-    5.0  # log-odds that another scale of alpha_u than the logarithmic one must reach, and tanh units in it
-)
+# Log-odds that tanh units of alpha_u's networks must reach, and another scale of it than the logarithmic one.
+_LOG_ODDS = 5.0
 _AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
 _GRID = 13  # values of each control at which networks are compared
 
