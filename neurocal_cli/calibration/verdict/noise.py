@@ -29,6 +29,7 @@ from neurocal_cli.observations.target import Target
 _ONE_WAY = 2.5  # rms along u over that along v, or the reverse
 _VIEW = 4.0  # rms of a view over the lower quartile of all views
 _TAKEN_IN = 1e-2  # share of the error that is left
+_FEWEST = 6  # points with a sigma that is too small: so few reach the factor once in 500,000 sets
 # Between views or points whose sigma is too small and the others, and between the sigmas of such points.
 _FACTOR = 2.0
 
@@ -99,7 +100,7 @@ def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[
     usual = median(sigma)
     few = sigma * _FACTOR < usual
     n = int(few.sum())
-    if n < FEW_POINTS:
+    if n < _FEWEST:
         return
     squared = (residuals**2).sum(axis=1) / sigma**2
     ratio = float(squared[few].mean() / max(squared[~few].mean(), NOTHING))
