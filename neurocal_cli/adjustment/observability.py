@@ -164,13 +164,15 @@ def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
 def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance) -> float:
     """Relative std of the scale in the image centre, the larger of u and v; 0 if both are given.
 
-    In models with xi this scale depends on alpha and xi together.
+    In models with xi this scale depends on alpha and xi together. It is infinite beyond an infinite scale.
     """
     free = np.flatnonzero(problem.free_with(state.model))
     largest = 0.0
     for entry in (0, 2):
         if entry not in free:
             continue
+        if state.entries[0, entry] <= 0:
+            return float("inf")
         gradient = (free == entry) / state.entries[0, entry]
         if state.model in WITH_XI:
             gradient = gradient - (free == 5) / (1 + state.k[0])

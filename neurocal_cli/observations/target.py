@@ -64,7 +64,8 @@ class Target:
     bends: Bends | None = None  # of each view, for a board that bends differently each time
 
     def __repr__(self) -> str:
-        shape = "flat" if self.flat else f"bent by {self.bend():.3g}"
+        shape = f"bent by {self.bend():.3g}" if self.has_planes else "in space"
+        shape = "flat" if self.flat else shape
         offset = float(np.sqrt((self.offsets**2).sum(axis=1).mean()))
         return f"Target of {len(self.found)} points, {shape}: {offset:.3g} rms from where they were given"
 

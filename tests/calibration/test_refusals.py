@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from support.plain_projection import project
+from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
-from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate, read_points
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
@@ -86,6 +87,12 @@ def test_the_help_with_one_view_of_one_plane_is_true() -> None:
     assert converges([BOARD] * 2, [tilted(1), tilted(2)], **CENTRE)
     assert converges([BOARD] * 3, [tilted(1), tilted(2), tilted(3)])
     assert converges([FOLDED], [AHEAD])
+
+
+def test_parallel_boards_that_fit_a_scale_beyond_infinity_are_told(real_files: RealFiles) -> None:
+    points = read_points(real_files("photographs/points_webcam_right.csv"))
+    half = points.select(points.view_index < points.n_views // 2)
+    refused(half, "the 5 boards are all parallel", distortion="k1")
 
 
 def test_two_views_of_one_plane_are_too_few_for_a_camera_with_skew() -> None:
