@@ -331,9 +331,9 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     cameras predict.
 
     Without POINTS.csv the points of the rig itself are used, and the errors are too optimistic. With
-    POINTS.csv the poses of the frames are fitted first, with the cameras fixed. With --at, a table says how
-    well points and lengths are triangulated at this distance from the first camera, by all cameras that see
-    them.
+    POINTS.csv the poses of the frames are fitted first, with the cameras fixed, and the verdict tells whether
+    the rig still holds. With --at, a table says how well points and lengths are triangulated at this distance
+    from the first camera, by all cameras that see them.
 
     \b
     Examples:

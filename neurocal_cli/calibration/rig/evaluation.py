@@ -11,7 +11,7 @@ line of sight with the size of a pixel at the depth of the point.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 
 import numpy as np
@@ -233,6 +233,38 @@ def evaluate_stereo_rig(
     return _Evaluator((rig.left, rig.right), rig, points, method).evaluation()
 
 
+def judged_by_points(
+    verdict: Verdict,
+    rmse_px: float,
+    cameras: Mapping[str, Calibration],
+    fits: Mapping[str, Calibration],
+    residuals: Array,
+    otherwise: Callable[[int], Iterable[Finding]] = lambda grade: (),
+) -> Verdict:
+    """Add what given points say to the verdict of a rig with this reprojection error [px].
+
+    The points have these residuals (N,) [px], nan behind a camera. `fits` are the cameras with the poses of
+    the given views in each alone, and `otherwise` explains an error of a grade.
+    """
+    squares, some = residuals[np.isfinite(residuals)] ** 2, "both" if len(cameras) == 2 else "all"
+    own = next(iter(cameras.values())).points
+    given = own, squares, len(residuals), f"rig, with {some} cameras as they were"
+    error = given_error(verdict, rmse_px, *given)
+    if error[0] and (noise := _noise_of_given(cameras, fits)) is not None:
+        error = given_error(verdict, max(rmse_px, noise), *given)
+    findings = [*(otherwise(error[0]) if error[0] else ()), error]
+    for name, fit in fits.items():
+        findings += [(grade, f"{name} camera: {text}", advice) for grade, text, advice in given_camera(fit)]
+    return with_findings(verdict, findings)
+
+
+def _noise_of_given(cameras: Mapping[str, Calibration], fits: Mapping[str, Calibration]) -> float | None:
+    """Rms error of cameras calibrated from the given points [px], if all are as they were."""
+    drifts = [drift_since(cameras[name], fit.points) for name, fit in fits.items()]
+    errors = [drift.error_px for drift in drifts if drift is not None and not drift.different]
+    return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) == len(fits) > 0 else None
+
+
 class _Evaluator:
     """Two cameras and the points of both, with the poses of views that the cameras do not have."""
 
@@ -343,27 +375,10 @@ class _Evaluator:
         if verdict is None:
             return None
         residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
-        squares = residuals[np.isfinite(residuals)] ** 2
-        given = rig.left.points, squares, len(residuals), "rig, with both cameras as they were"
-        findings = [given_error(verdict, rig.rmse_px, *given)]
-        if findings[0][0] and (noise := self._noise_of_given()) is not None:
-            findings = [given_error(verdict, max(rig.rmse_px, noise), *given)]
-        if findings[0][0]:
-            findings = [*self._other_size(rig, findings[0][0]), *findings]
-        for side, fit in zip(("left", "right"), self.fitted or (None, None), strict=True):
-            findings += [
-                (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(fit)
-            ]
-        return with_findings(verdict, findings)
-
-    def _noise_of_given(self) -> float | None:
-        """Rms error of cameras calibrated from the given points [px], if both are as they were."""
-        drifts = [
-            drift_since(camera, fit.points)
-            for camera, fit in zip(self.cameras, self.fitted or (), strict=False)
-        ]
-        errors = [drift.error_px for drift in drifts if drift is not None and not drift.different]
-        return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) == 2 else None
+        sides = self.cameras, self.fitted or ()
+        cameras, fits = (dict(zip(("left", "right"), some, strict=False)) for some in sides)
+        other_size = partial(self._other_size, rig)
+        return judged_by_points(verdict, rig.rmse_px, cameras, fits, residuals, other_size)
 
     def _other_size(self, rig: StereoRig, grade: int) -> Iterator[Finding]:
         """The finding about given points of a target of another size or unit, if that is what is wrong.

@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibrate import fit_poses
-from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.evaluation import refuse_another_size
-from neurocal_cli.calibration.rig.frames import check_one_target, match_views
+from neurocal_cli.calibration.rig.evaluation import judged_by_points
+from neurocal_cli.calibration.rig.frames import FrameNames, check_one_target, match_views
 from neurocal_cli.calibration.rig.many_views import SpacePoints, triangulate_many
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
@@ -87,7 +88,8 @@ def evaluate_rig(rig: Rig, points: Mapping[str, Correspondences] | None = None) 
     check_one_target(points)
     label, frames, camera, pixels, world = _rows(points)
     found = triangulate_many(rig, label, camera, pixels)
-    poses = _known(rig) if not given else _fitted(rig, points)
+    fits = _fitted(rig, points) if given else {}
+    poses = _on_rig(rig, fits) if given else _known(rig)
     first = np.zeros(len(found.points), dtype=np.intp)  # a row of each point
     first[label[::-1]] = np.arange(len(label))[::-1]
     known = (found.n_cameras > 1) & np.array([frames[row] in poses for row in first])
@@ -111,7 +113,7 @@ def evaluate_rig(rig: Rig, points: Mapping[str, Correspondences] | None = None) 
         frames={name: float(np.sqrt(np.mean(squares))) for name, squares in by_frame.items()},
         predicted=_predicted(rig, label, camera, pixels),
         fitted=given,
-        verdict=rig.verdict,
+        verdict=_judged(rig.verdict, rig, fits, poses) if fits and rig.verdict is not None else rig.verdict,
     )
 
 
@@ -143,14 +145,39 @@ def _known(rig: Rig) -> dict[str, Pose]:
     return found
 
 
-def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
-    """Poses of given frames in the first camera that fit all cameras of the rig best."""
-    from neurocal_cli.calibration.rig.calibrate_rig import poses_on_rig, with_poses
+def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Calibration]:
+    """The cameras with the poses of the given views in each alone."""
+    from neurocal_cli.calibration.rig.calibrate_rig import with_poses
 
     usable, _ = with_poses(points)
-    fits = {name: fit_poses(one, rig.cameras[name], 0) for name, one in usable.items()}
-    views = match_views({name: fit.points.view_names for name, fit in fits.items()})
-    return poses_on_rig(rig.poses, fits, views)
+    return {name: fit_poses(one, rig.cameras[name], 0) for name, one in usable.items()}
+
+
+def _on_rig(rig: Rig, fits: Mapping[str, Calibration]) -> dict[str, Pose]:
+    """Poses of given frames in the first camera that fit all cameras of the rig best."""
+    from neurocal_cli.calibration.rig.calibrate_rig import poses_on_rig
+
+    return poses_on_rig(rig.poses, fits, _frames_of(fits))
+
+
+def _frames_of(fits: Mapping[str, Calibration]) -> FrameNames:
+    return match_views({name: fit.points.view_names for name, fit in fits.items()})
+
+
+def _judged(
+    verdict: Verdict, rig: Rig, fits: Mapping[str, Calibration], poses: Mapping[str, Pose]
+) -> Verdict:
+    """The verdict with the findings about the given points in frames of several cameras."""
+    frames, residuals = _frames_of(fits), []
+    for (name, fit), of_views in zip(fits.items(), frames.of_views, strict=True):
+        frame_of = {view: frames.names[k] for view, k in zip(fit.points.view_names, of_views, strict=True)}
+        known = np.array([frame_of[view] in poses for view in fit.points.view_names])
+        points = fit.points.select(known[fit.points.view_index])
+        seen = [poses[frame_of[view]] for view in points.view_names]
+        world = rig.poses[name].to_camera(in_cameras(seen, points.world, points.view_index))
+        predicted, in_front = rig.cameras[name].camera.project(world)
+        residuals.append(np.where(in_front, np.hypot(*(predicted - points.pixels).T), np.nan))
+    return judged_by_points(verdict, rig.rmse_px, rig.cameras, fits, np.concatenate(residuals))
 
 
 def _predicted(

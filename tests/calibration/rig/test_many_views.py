@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.many_cameras import scene
+from support.many_cameras import moved, scene
 
 from neurocal_cli import calibrate_rig, evaluate_rig, triangulate, triangulate_many
 from neurocal_cli.camera.geometry import Array
@@ -141,5 +141,14 @@ def test_a_rig_is_evaluated_on_its_own_and_on_new_points() -> None:
     assert other.fitted
     assert other.rmse < 9
     assert other.predicted["cam1"][0] == 0
+    assert other.verdict is not None
+    assert rig.verdict is not None
+    assert other.verdict.word == rig.verdict.word
+    turned = moved(truth, "cam2", 1.0, 0.0).points(0.3, np.random.default_rng(99))
+    changed = evaluate_rig(rig, turned).verdict
+    assert changed is not None
+    assert changed.word == "poor"
+    assert "times the" in changed.reasons[0]
+    assert "all cameras as they were" in changed.advice[0]
     with pytest.raises(InputError, match="no camera 'x'"):
         evaluate_rig(rig, {"x": new["cam0"]})
