@@ -249,8 +249,10 @@ def _triangulate_many(
         )
     counts = {"n_points": len(found.points), "n_off": off, "n_behind": behind, "n_without": without}
     summarise(as_json, {**counts, "error_limit_px": limit}, ", ".join(parts))
-    several = found.n_cameras > 1
-    _warned_of_noise(sigma, found.error[several], 2 * found.n_cameras[several] - 3)
+    # With all cameras: without those that contradict, what is left looks more accurate than it is.
+    whole = triangulate_many(rig, seen.point, seen.camera, seen.pixels) if without else found
+    several = whole.n_cameras > 1
+    _warned_of_noise(sigma, whole.error[several], 2 * whole.n_cameras[several] - 3)
 
 
 def _rig(names: tuple[str, ...]) -> StereoRig:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import Result
 from support.command_line import run
@@ -107,6 +109,23 @@ def test_points_that_many_cameras_saw_are_triangulated(made: tuple[Path, Result]
     unknown = tmp_path / "unknown.csv"
     unknown.write_text("point,camera,u,v\na,top,1,2\n")
     assert "there is no camera 'top'" in run("triangulate", made[0], unknown).stderr
+
+
+def test_pixels_of_many_cameras_that_are_less_accurate_are_told_their_noise(
+    made: tuple[Path, Result], tmp_path: Path
+) -> None:
+    rig, rng, rows = read_rig(made[0]), np.random.default_rng(3), ["point,camera,u,v"]
+    for k, world in enumerate(rng.uniform((-300, -300, 2100), (300, 300, 2700), (80, 3))):
+        for name, camera in rig.cameras.items():
+            [pixel], _ = camera.camera.project(rig.poses[name].to_camera(world[None]))
+            u, v = pixel + rng.normal(0, 6 * rig.sigma, 2)
+            rows.append(f"p{k},{name},{u},{v}")
+    (tmp_path / "sightings.csv").write_text("\n".join(rows))
+    said = run("triangulate", made[0], tmp_path / "sightings.csv").stderr
+    assert "measured without a camera that contradicts the others" in said
+    told = re.search(r"give --sigma ([\d.]+) if", said)
+    assert told is not None, said
+    assert float(told[1]) == pytest.approx(6 * rig.sigma, rel=0.15)  # 3.6 times if some are left out
 
 
 def test_two_of_the_cameras_are_rectified(made: tuple[Path, Result], tmp_path: Path) -> None:
