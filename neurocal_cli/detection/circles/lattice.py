@@ -40,7 +40,7 @@ _NEIGHBOURS = 8  # saddle points near each other where small circles are looked 
 _ROUND, _ROUND_PX = 0.04, 0.5  # deviation from an ellipse over its radius, and px of it
 _THIN = 0.1  # least ratio of the axes
 _COMPACT = 0.02  # least area over the squared length of an outline; 0.02 of the thinnest ellipse
-_OUTSIDE = 1.25  # radii, where it is lighter
+_INSIDE, _OUTSIDE = 0.8, 1.25  # radii, where it is dark, and lighter
 _SAME = 0.5  # radii of the smaller one between centres of the same blob
 
 
@@ -173,19 +173,27 @@ def _joined(outlines: list[NDArray[Any]]) -> tuple[NDArray[np.intp], Array]:
 
 
 def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether ellipses (n,) are darker than what is around them; windows find rings around light discs."""
+    """Whether ellipses (n,) are darker than what is around them, in the middle and along the outline.
+
+    Windows find rings around light discs, and a light ring around a disc has an outline of its own.
+    """
     if not outlines:
         return np.zeros(0, dtype=np.bool_)
     of, points = _joined(outlines)
-    beyond = np.rint(centre[of] + _OUTSIDE * (points - centre[of])).astype(int)
-    u, v = np.clip(beyond, 0, np.array(image.shape[::-1]) - 1).T
-    levels = image[v, u].astype(float)
-    levels = levels[np.lexsort((levels, of))]
     count = np.bincount(of)
     first = np.cumsum(count) - count
-    median = 0.5 * (levels[first + (count - 1) // 2] + levels[first + count // 2])
+
+    def level(radii: float) -> Array:
+        """Medians along the outlines, enlarged by a factor."""
+        places = np.rint(centre[of] + radii * (points - centre[of])).astype(int)
+        u, v = np.clip(places, 0, np.array(image.shape[::-1]) - 1).T
+        levels = image[v, u].astype(float)
+        levels = levels[np.lexsort((levels, of))]
+        return np.asarray(0.5 * (levels[first + (count - 1) // 2] + levels[first + count // 2]))
+
+    around = level(_OUTSIDE)
     x, y = np.rint(centre).astype(int).T
-    return np.asarray(image[y, x] < median - _STEPS[0])
+    return np.asarray((image[y, x] < around - _STEPS[0]) & (level(_INSIDE) < around))
 
 
 _ALIKE = 2.2  # greatest ratio of the areas of circles on the board
