@@ -17,6 +17,7 @@ from support.slow_cases import slow_but
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.lattice import Blobs, lattices, place_circles
 from neurocal_cli.detection.circles.measuring import _missed
+from neurocal_cli.detection.circles.pattern import seen_circles
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import InputError
@@ -149,6 +150,19 @@ def test_rings_are_round(radius: int, width: int) -> None:
     assert len(found.ids) == 42
     at = np.array([[int(part) for part in name.split(":")] for name in found.ids])
     np.testing.assert_allclose(found.pixels, [45, 35] + at * [52, 50], atol=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outlines_around_rings_are_no_circles(seed: int) -> None:
+    ink = np.zeros((320, 420), np.uint8)
+    for row in range(6):
+        for column in range(7):
+            cv2.circle(ink, (45 + 52 * column, 35 + 50 * row), 12, (255,), 5, cv2.LINE_AA)
+    light = (90 + 0.3 * np.arange(420)) * (1 - 0.75 * ink / 255)
+    noise = 6 * np.random.default_rng(seed).normal(size=ink.shape)
+    found = seen_circles(np.clip(cv2.GaussianBlur(light, (0, 0), 1.2) + noise, 0, 255).astype(np.uint8))
+    assert found is not None
+    assert (str(found), found.full) == ("7 x 6 circles", True)
 
 
 def test_another_number_of_circles_is_no_board() -> None:
