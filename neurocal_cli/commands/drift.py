@@ -55,6 +55,7 @@ def drift(old: str, new: str, plots: Plots, as_json: bool) -> None:
       neurocal drift rig.yaml rig.yaml
     """  # noqa: D301 - as in the group
     preparation.check((old, new), plots=plots)
+    from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.drift import SHARE, find_drift
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.rig_drift import find_rig_drift
@@ -81,6 +82,11 @@ def drift(old: str, new: str, plots: Plots, as_json: bool) -> None:
         show.drift_report(before, after, one).print(as_json)
     write_plots(plots, show.draw_drift, {name: (found[name], sizes[name]) for name in found}, limit)
     if different:
+        for name, result in ((old, before), (new, after)):
+            if isinstance(result, (Calibration, Rig)):
+                preparation.warn_of_poor(
+                    f"calibration {name}", result, "; its errors may be all that differs"
+                )
         click.get_current_context().exit(_DIFFERENT)
 
 

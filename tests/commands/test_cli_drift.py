@@ -40,7 +40,13 @@ def test_a_camera_that_moved_is_named_and_the_exit_status_is_4(rig: Path, tmp_pa
     assert answer["different"]
     assert answer["poses"]["right"]["different"]
     assert not any(camera["different"] for camera in answer["cameras"].values())
-    assert "right has moved relative to left" in run("drift", rig, moved).output
+    said = run("drift", rig, moved)
+    assert "right has moved relative to left" in said.output
+    assert "poor" not in said.stderr
+    moved.write_text(moved.read_text().replace("word: usable", "word: poor"))
+    warned = run("drift", rig, moved).stderr
+    assert f"calibration {moved} is poor: " in warned
+    assert "its errors may be all that differs" in warned
 
 
 def test_a_rig_and_a_camera_are_not_compared(rig: Path, tmp_path: Path) -> None:
