@@ -27,8 +27,16 @@ from neurocal_cli.errors import InputError, UsageError
 
 T = TypeVar("T")
 
+
+def _plain(kind: Any) -> Any:
+    """What a kind is an alias for, as NDArray of newer NumPy is on newer Python."""
+    value = getattr(get_origin(kind), "__value__", None)
+    return kind if value is None else value[get_args(kind)]
+
+
+_ARRAY = _plain(Array)
 _WORDS = {
-    Array: "an array of real numbers",
+    _ARRAY: "an array of real numbers",
     NoneType: "None",
     Path: "a path",
     bool: "True, False",
@@ -116,8 +124,8 @@ def _taken(name: str, value: Any, kinds: Mapping[str, Any]) -> Any:
         words = " or ".join(dict.fromkeys(map(_words, _with_choices_joined(one_of))))
         told = "; give ".join([f"{name} must be {words}, not {shown}", *instead[:1]])
         raise UsageError(told) if option else InputError(told)
-    if value is not None and one_of in ([Array], [int], [float], [bool]):
-        return real_array(name, value) if one_of == [Array] else one_of[0](value)
+    if value is not None and one_of in ([_ARRAY], [int], [float], [bool]):
+        return real_array(name, value) if one_of == [_ARRAY] else one_of[0](value)
     return value
 
 
@@ -136,11 +144,12 @@ def _with_choices_joined(kinds: list[Any]) -> list[Any]:
 
 
 def _alternatives(kind: Any) -> tuple[Any, ...]:
-    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    return tuple(map(_plain, get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)))
 
 
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a kind; what other checks tell better passes."""
+    kind = _plain(kind)
     origin, inside = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in inside)
@@ -204,6 +213,7 @@ def _fits_several(value: Any, origin: Any, inside: tuple[Any, ...]) -> bool:
 
 
 def _words(kind: Any) -> str:
+    kind = _plain(kind)
     origin, inside = get_origin(kind), get_args(kind)
     if kind in _WORDS:
         return _WORDS[kind]
