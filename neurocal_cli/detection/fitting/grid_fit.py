@@ -67,6 +67,7 @@ from neurocal_cli.detection.fitting.strips import ANCHOR, FOUND, GridEdges, Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 
 # Insensitive: later stages correct the errors of earlier ones.
+_START_SIGMA = 0.3  # px; standard deviation of the coordinates of the found vertices
 _GOOD_START = 1.3  # chi2 per coordinate of these vertices below which no richer map is tried
 # Relative radial displacement by the lens above which a wide lens is tried: at once; after the first fit; and
 # after the first fit if the excess variance is below _UNEVEN.
@@ -152,7 +153,7 @@ def map_of_vertices(grid_image: GridImage) -> MapFit:
     start = homography_start(
         Frame.of(vertices, grid_image.size, grid_image.grid.lines), vertices, grid_image.pixels
     )
-    anchors = grid_image.anchors(FOUND)
+    anchors = grid_image.anchors(FOUND if grid_image.is_small else _START_SIGMA)
     found = select_map(start, anchors, np.zeros(1), _GOOD_START)
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, anchors, _GOOD_START)

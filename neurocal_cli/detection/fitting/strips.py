@@ -197,9 +197,10 @@ def _column(x: Array) -> Single:
 
 
 ANCHOR = 2.0  # px; standard deviation that keeps an edge that is not good from having an effect
-# px; standard deviation of the found vertices, without which a few edges would not determine the lens of a
-# small part of a board, and number of edges above which later maps do not need them
-FOUND, _ENOUGH = 0.15, 60
+# px; standard deviation of the found vertices of small parts of boards, whose few edges do not determine a
+# lens, and the number of these; those of whole boards in photographs would displace their edges.
+FOUND, _SMALL = 0.15, 15
+_ENOUGH = 60  # edges above which later maps do not need the vertices as anchors
 
 
 @frozen_dataclass(eq=False)
@@ -231,6 +232,11 @@ class GridImage:
         """(V, 2) pixels of the found vertices."""
         return self.grid.pixels[self.grid.seen]
 
+    @property
+    def is_small(self) -> bool:
+        """Whether so small a part of a board is seen that its edges do not determine a lens."""
+        return len(self.vertices) <= _SMALL and not self.grid.paired
+
     def anchors(self, sigma: float, shifts: int = 1) -> Observations:
         """The found vertices as observations of a map, with a standard deviation [px]."""
         return Observations.of_points(self.vertices, self.pixels, sigma, shifts)
@@ -240,7 +246,7 @@ class GridImage:
         edges = self.edges.observations(lines, offset, variance, shift)
         if len(offset) > _ENOUGH:
             return edges
-        return edges.joined_with(self.anchors(ANCHOR if self.grid.paired else FOUND, shift.shape[1]))
+        return edges.joined_with(self.anchors(FOUND if self.is_small else ANCHOR, shift.shape[1]))
 
 
 @frozen_dataclass(eq=False)
