@@ -11,7 +11,7 @@ from panels import photographed
 from style import BLUE, INK, ORANGE, SAMPLES, figure, save
 
 from neurocal_cli import Calibration, calibrate, evaluate_camera, read_image
-from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
+from neurocal_cli.calibration.verdict.evidence import Evidence
 
 SHOWN, ENLARGED = "photo02", 200
 LEVELS = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0)  # px
@@ -62,7 +62,7 @@ def _draw_residuals(axes: Axes, found: Calibration) -> None:
 
 def _draw_trust(axes: Axes, found: Calibration) -> Any:
     """Standard deviation of predicted pixels at the distance of the views."""
-    known = uncertainty_over_image(found)
+    known = Evidence(found).projection
     assert known is not None
     std = np.clip(known.std[1], LEVELS[0], LEVELS[-1])
     norm = matplotlib.colors.BoundaryNorm(LEVELS, 256)

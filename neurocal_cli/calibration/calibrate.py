@@ -16,9 +16,9 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, undistorted_before
 from neurocal_cli.calibration.fit import fit, shows_skew
 from neurocal_cli.calibration.result import calibration_of, with_given_covariance
-from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
 from neurocal_cli.calibration.verdict.odd_points import repeated_views
+from neurocal_cli.calibration.verdict.rules import assess
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion, Model

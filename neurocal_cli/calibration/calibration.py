@@ -96,7 +96,7 @@ class Verdict:
     word: str  # "good", "usable" or "poor"
     reasons: tuple[str, ...]  # what is wrong, the worst first; empty for a good calibration
     advice: tuple[str, ...]  # what to do about it
-    # The measures behind it (`calibration.verdict.measures.Evidence`); nan if not determined.
+    # The measures behind it (`calibration.verdict.evidence.Evidence`); nan if not determined.
     measures: Mapping[str, float]
 
 

@@ -164,7 +164,7 @@ def _with_root(given: Calibration | Camera) -> tuple[Camera, Array]:
     """A camera and a root (5 + K, f) of the covariance of A's entries [px] and its coefficients."""
     if isinstance(given, Camera):
         return given, np.zeros((5 + len(given.distortion.coefficients), 1))
-    from neurocal_cli.calibration.verdict.assessment import camera_and_covariance
+    from neurocal_cli.calibration.measurement import camera_and_covariance
 
     camera, covariance = camera_and_covariance(given)
     if not np.isfinite(covariance).all():

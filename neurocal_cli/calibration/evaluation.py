@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
 from neurocal_cli.calibration.drift import Drift
-from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.contest import given_camera as against_given
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import (
     ELSEWHERE,
     ERROR,
@@ -250,7 +250,7 @@ def changed_camera(drift: Drift | None) -> list[Finding]:
 
 def given_camera(fit: Calibration | None) -> list[Finding]:
     """Findings about the camera from views whose poses were fitted with it."""
-    held = None if fit is None else gather_evidence(fit).contest
+    held = None if fit is None else Evidence(fit).contest
     return [] if fit is None or held is None else against_given(held, fit)
 
 

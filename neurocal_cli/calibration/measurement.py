@@ -7,18 +7,18 @@ is measured with an error du shows the point X + B^-1 (du - J dc).
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.covariance import entry_covariance
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.assessment import (
-    camera_and_covariance,
-    pixel_covariance_of,
-    position_covariance_of,
-)
-from neurocal_cli.calibration.verdict.measures import image_grid
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.calibration.verdict.evidence import evidence_of
+from neurocal_cli.calibration.verdict.measures import image_grid, pixel_covariance
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.given_values import real_rows
 from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, ProjectedPoints, Spread
 from neurocal_cli.errors import InputError
+from neurocal_cli.observations.target import std_of_scale
 
 
 def project(calibration: Calibration, points: Array, view: str | None = None) -> ProjectedPoints:
@@ -27,12 +27,42 @@ def project(calibration: Calibration, points: Array, view: str | None = None) ->
     if view is not None:
         points = calibration.pose_of(view).to_camera(points)
     pixels, seen = calibration.camera.project(points)
-    covariance = pixel_covariance_of(calibration, points[seen], view)
-    if covariance is not None:
-        everywhere = np.full((len(points), 2, 2), np.nan)
-        everywhere[seen] = covariance
-        covariance = everywhere
-    return ProjectedPoints(pixels, covariance, seen)
+    return ProjectedPoints(pixels, _pixel_covariance(calibration, points, seen, view), seen)
+
+
+def _pixel_covariance(
+    calibration: Calibration, points: Array, seen: NDArray[np.bool_], view: str | None
+) -> Array | None:
+    """Covariance (N, 2, 2) [px^2] of the pixels of points (N, 3) in the camera's frame; nan where not seen.
+
+    None if the calibration has no points of its own. See `pixel_covariance`.
+    """
+    found = evidence_of(calibration)
+    if found is None:
+        return None
+    m, camera, shared = found.opened()
+    covariance = np.full((len(points), 2, 2), np.nan)
+    covariance[seen] = pixel_covariance(m, camera, found.variance, points[seen], shared, view)
+    return covariance
+
+
+def camera_and_covariance(calibration: Calibration) -> tuple[Camera, Array]:
+    """The camera, and the covariance (5 + K, 5 + K) of A's entries [px] and its coefficients.
+
+    Given ones have none. With points of its own, the camera has the coefficients that the selection of its
+    distortion model leaves open, too, so that the covariance includes the uncertainty of that choice.
+    """
+    c, found = calibration, evidence_of(calibration)
+    if found is None:
+        return c.camera, entry_covariance(c.intrinsics, c.distortion_model, *c.known_covariance, 1.0)
+    m, camera, shared = found.opened()
+    whole = np.zeros((len(m.free), len(m.free)))
+    whole[np.ix_(m.free, m.free)] = shared
+    if m.state.square:  # A22 is A11
+        whole[2], whole[:, 2] = whole[0], whole[:, 0]
+        whole[2, 2] = whole[0, 0]
+    to_pixels = np.array([found.views.pixel_scale] * 5 + [1.0] * (len(m.free) - 5))
+    return camera, to_pixels[:, None] * whole * to_pixels
 
 
 _STEEPEST = np.cos(np.radians(75.0))  # of the rays of a wide lens that are judged
@@ -58,11 +88,9 @@ def on_plane(calibration: Calibration, pixels: Array, view: str, sigma: float | 
     back = np.linalg.inv(by_point @ pose.R[:, :2])
     by_pixel = np.full((len(pixels), 2, 2), np.nan)
     by_pixel[seen] = sigma**2 * back @ np.swapaxes(back, 1, 2)
-    predicted = pixel_covariance_of(calibration, in_camera[seen], view)
-    by_calibration = None
-    if predicted is not None:
-        by_calibration = np.full((len(pixels), 2, 2), np.nan)
-        by_calibration[seen] = back @ predicted @ np.swapaxes(back, 1, 2)
+    by_calibration = _pixel_covariance(calibration, in_camera, seen, view)
+    if by_calibration is not None:
+        by_calibration[seen] = back @ by_calibration[seen] @ np.swapaxes(back, 1, 2)
     return PlanePoints(points, by_calibration, by_pixel, seen)
 
 
@@ -80,9 +108,20 @@ def _check_flat(calibration: Calibration, view: str) -> None:
 
 
 def position(calibration: Calibration, view: str) -> CameraPosition:
-    """Where the camera was; see `Calibration.position`."""
-    pose = calibration.pose_of(view)
-    return CameraPosition(-pose.R.T @ pose.t, position_covariance_of(calibration, view))
+    """Where the camera was; see `Calibration.position`.
+
+    A step (w, d) of the pose about the target's centre moves it by -s R^T (d + tau x w).
+    """
+    pose, found, covariance = calibration.pose_of(view), evidence_of(calibration), None
+    if found is not None:
+        covariance = np.zeros((3, 3))
+        if not calibration.views[view].fixed:
+            k = found.views.names.index(view)
+            R, tau = found.state.R[k], found.state.t[k]
+            M = -found.views.scale[k] * R.T @ np.hstack([cross_matrix(tau), np.eye(3)])
+            of_scale = std_of_scale(calibration.points, calibration.target) * (pose.R.T @ pose.t)
+            covariance = M @ found.pose_covariance[k] @ M.T + np.outer(of_scale, of_scale)
+    return CameraPosition(-pose.R.T @ pose.t, covariance)
 
 
 def errors_at(calibration: Calibration, distance: float) -> PlaneErrors:

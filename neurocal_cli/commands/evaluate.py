@@ -162,7 +162,7 @@ def camera(
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.drift import drift_since
     from neurocal_cli.calibration.evaluation import evaluate_camera, judged_by_points
-    from neurocal_cli.calibration.verdict.assessment import assess
+    from neurocal_cli.calibration.verdict.rules import assess
     from neurocal_cli.commands.show import camera_report as show
     from neurocal_cli.commands.show.drift_report import since_report
     from neurocal_cli.commands.show.text import Report

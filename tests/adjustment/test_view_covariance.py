@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.covariance import counting_views
 from neurocal_cli.adjustment.cross_validation import Minimum, Quadratics
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.views import Views, arrange
-from neurocal_cli.calibration.verdict.assessment import _AtMinimum
+from neurocal_cli.calibration.verdict.evidence import Evidence
 
 NO_SKEW = np.array([1, 0, 1, 1, 1], dtype=bool)
 
@@ -92,7 +92,7 @@ def test_errors_of_clean_views_are_as_the_std_say(n_views: int) -> None:
 
 def noise_std(views: Views, found: Calibration) -> float:
     """Std of alpha_u from the normal matrix alone."""
-    entries = _AtMinimum(found).minimum.covariance(views.n_equations).shared
+    entries = Evidence(found).minimum.covariance(views.n_equations).shared
     return float(np.sqrt(entries[0, 0])) * views.pixel_scale
 
 
@@ -141,7 +141,7 @@ def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
     options = {"skew": False, "distortion": "k1k2", "outliers": "keep", "target": "given"}
     whole = calibrate(points, **options)
     others = [calibrate(points.select(points.view_index != k), **options) for k in range(10)]
-    m = _AtMinimum(whole).minimum
+    m = Evidence(whole).minimum
     told = covariance_module.jackknife(m.quadratics.moves_without_each())
     alphas = np.array([c.intrinsics.alpha_u for c in others])
     jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())

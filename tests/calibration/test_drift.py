@@ -15,7 +15,7 @@ from support.sessions import SIZE, camera, session
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.calibration.drift import SHARE, drift_since, find_drift
-from neurocal_cli.calibration.verdict.assessment import camera_and_covariance
+from neurocal_cli.calibration.measurement import camera_and_covariance
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics

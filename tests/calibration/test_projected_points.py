@@ -8,7 +8,7 @@ from support.made_calibration import CAMERA, made_calibration
 from support.noisy_flat_set import TRUE, pose, trial
 from support.plain_projection import project
 
-from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 
@@ -39,7 +39,7 @@ def test_pixels_scatter_as_their_covariance_says(trials: int, low: float, high: 
 
 def test_without_a_view_the_std_is_that_of_the_verdict() -> None:
     camera = trial(0)
-    over = uncertainty_over_image(camera)
+    over = Evidence(camera).projection
     assert over is not None
     depth = float(over.depths[1])
     found = camera.project(depth * camera.camera.seen_points(over.pixels))

@@ -14,7 +14,7 @@ from support.wide_scenes import WideScene, wide_set
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.calibration.rig.triangulation import METHODS, triangulate
-from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
@@ -230,7 +230,7 @@ def coefficient_errors_over_std(scene: WideScene, one: Calibration) -> Array:
 
 def projected_over_std(scene: WideScene, one: Calibration) -> float:
     """Errors of projected pixels over their reported std, rms over the field that is seen."""
-    told = gather_evidence(one).projection
+    told = Evidence(one).projection
     assert told is not None
     rays = one.camera.unproject(told.pixels)
     with np.errstate(invalid="ignore"):

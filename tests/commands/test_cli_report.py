@@ -19,7 +19,7 @@ from support.rigs import random_rig, sides
 from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration.calibration import Rejected, Verdict
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
-from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.commands.show.html_page import (
     board_shape,
     enlargement,
@@ -270,7 +270,7 @@ def test_the_map_has_each_value_where_it_is_and_none_where_there_is_none() -> No
 def test_the_page_shows_how_uncertain_the_camera_is(tmp_path: Path) -> None:
     calibration = made_calibration(3)
     write_calibration(calibration, tmp_path / "camera.yaml")
-    found = uncertainty_over_image(calibration)
+    found = Evidence(calibration).projection
     assert found is not None
     page = run("report", tmp_path / "camera.yaml").stdout
     assert f"middle distance; {found.worst:.3g} px at most" in page

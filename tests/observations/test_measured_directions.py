@@ -20,7 +20,7 @@ from neurocal_cli.adjustment.views import arrange, noise_model
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.straight_lines import find_lines
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
-from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
@@ -55,7 +55,7 @@ def test_standard_deviations_of_midpoints_hold(sets: int) -> None:
         found = pinhole(points, skew=False)
         one_way.append(sigmas(found, camera))
         both_ways.append(sigmas(pinhole(replace(points, across=None), skew=False, target="given"), camera))
-        disagreement.append(gather_evidence(found).disagreement)
+        disagreement.append(Evidence(found).disagreement)
     assert 0.85 < rms(one_way) < 1.15
     assert 0.85 < rms(both_ways) < 1.25  # 2.0 and more for those of the normal matrix
     assert np.mean(disagreement) == pytest.approx(1.0, abs=0.25)
@@ -96,7 +96,7 @@ def test_standard_deviations_of_a_rig_hold(rigs: int) -> None:
 
 @pytest.mark.slow
 def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
-    levels = [gather_evidence(pinhole(edge_set(seed)[1], skew=False)).contradiction for seed in range(20)]
+    levels = [Evidence(pinhole(edge_set(seed)[1], skew=False)).contradiction for seed in range(20)]
     assert np.mean(levels) == pytest.approx(1.0, abs=0.05)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
-from neurocal_cli.calibration.verdict.assessment import assess
+from neurocal_cli.calibration.verdict.rules import assess
 from neurocal_cli.camera.distortion import distort
 from neurocal_cli.errors import NeurocalError
 from support.plain_projection import project

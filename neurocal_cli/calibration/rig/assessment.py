@@ -2,7 +2,7 @@
 
 Everything is computed from the rig and its points, so a file can be judged like a fresh result:
 
-* the verdict on each camera by its own points (`calibration.verdict.assessment`);
+* the verdict on each camera by its own points (`calibration.verdict.rules`);
 * whether the frames agree on one rig, and if not, the cause (`causes`);
 * the cross-validation error over frames;
 * the uncertainty of the cameras' positions, and of the depth of triangulated points (`space_uncertainty`).
@@ -27,7 +27,6 @@ from neurocal_cli.calibration.rig.edges import described, pair_name
 from neurocal_cli.calibration.rig.problem import ViewEquations
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_uncertainty import depth_std, fitted, has_points
-from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     ELSEWHERE,
@@ -40,6 +39,7 @@ from neurocal_cli.calibration.verdict.findings import (
     percent,
     verdict_of,
 )
+from neurocal_cli.calibration.verdict.rules import assess
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 

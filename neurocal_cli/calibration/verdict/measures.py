@@ -14,22 +14,16 @@ over the views and cov(e) that of M B^-1 M^T; M converts a view's pose step to a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import Minimum, inverse_or_nan
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.verdict.findings import Finding
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
-
-if TYPE_CHECKING:
-    from neurocal_cli.calibration.verdict.contest import Contest
 
 _ACROSS = 21  # points across the image
 # The image circle of a wide lens is assumed to reach this times the angle of the farthest point, and at least
@@ -186,35 +180,3 @@ def _relief(points: Correspondences, views: Views, state: CameraState) -> float:
     away = np.linalg.norm(state.t * views.scale[:, None], axis=1)  # of each view's centroid
     along = [points.world[points.view_index == k] @ views.basis[k][:, 2] for k in solid]
     return max(float(np.ptp(one)) / float(away[k]) for one, k in zip(along, solid, strict=True))
-
-
-@frozen_dataclass(eq=False)
-class Evidence:
-    """Measures of a calibration's quality; the last two are None if there is nothing of the kind."""
-
-    rmse_px: float  # rms reprojection error of the calibration
-    held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
-    # Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
-    # networks are no freer than the camera.
-    precision_px: float
-    contradiction: float  # rms error, corrected likewise, over `precision_px`; 1 for noise alone
-    # Chi-squared per parameter of the difference between two halves of the data; 1 if the reported standard
-    # deviations hold.
-    disagreement: float
-    correlation: float  # of neighbouring residuals; 0 for noise
-    condition: float  # of the normal matrix scaled to a unit diagonal
-    coverage: Coverage
-    # At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
-    # image size is unknown.
-    projection: ProjectionUncertainty | None
-    repeated: tuple[str, ...]  # views that are copies of others
-    mirrored: tuple[str, ...]  # views that show the target mirrored
-    of_given: tuple[Finding, ...]  # against a given centre that the lens or the target hides
-    noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
-    stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
-    poses: int  # number of different poses among the views (`repeated_poses`)
-    contest: Contest | None  # the causes of the residuals
-    mistake: tuple[str, str] | None  # in the rows of all views, and what to do
-    # The parameter whose standard deviation grows most with what a named lens lacks and the points leave
-    # open, and by which factor.
-    lacking: tuple[str, float]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.cross_validation import quietly
+from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.calibration.calibration import (
     Calibration,
     StopReason,
@@ -16,6 +17,7 @@ from neurocal_cli.calibration.calibration import (
 )
 from neurocal_cli.calibration.verdict.contest import BIASED, closest, explains
 from neurocal_cli.calibration.verdict.contest import findings as causes
+from neurocal_cli.calibration.verdict.evidence import Evidence, has_points, views_behind
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     CORRELATED,
@@ -39,8 +41,7 @@ from neurocal_cli.calibration.verdict.findings import (
     two_digits,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.measures import Evidence
-from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
+from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points, repeated_views
 from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
@@ -67,8 +68,23 @@ _UNCHECKED = (
 )
 
 
-def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
-    """Apply the rules to the measures of a calibration."""
+@quietly
+def assess(calibration: Calibration, causes: bool = True) -> Verdict | None:
+    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own.
+
+    `causes` tells whether causes of the residuals are looked for.
+    """
+    if not has_points(calibration):
+        return None
+    behind = views_behind(calibration)
+    if behind:
+        reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
+        return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
+    return reach_verdict(Evidence(calibration, causes))
+
+
+def reach_verdict(evidence: Evidence) -> Verdict:
+    """Apply the rules to what the points of a calibration tell."""
     projection = evidence.projection
     worst = projection.worst if projection is not None else float("nan")
     measures = {
@@ -82,7 +98,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
         "projection_px": worst,
         "condition": evidence.condition,
     }
-    return verdict_of(_findings(calibration, evidence), measures)
+    return verdict_of(_findings(evidence.calibration, evidence), measures)
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
@@ -91,7 +107,6 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         return
     if evidence.mistake is not None:  # it explains what would be taken for another cause
         yield 2, evidence.mistake[0], evidence.mistake[1]
-        evidence = replace(evidence, contest=None)
     if not calibration.converged:
         named = not calibration.lens_choice and calibration.distortion_model != "none"
         slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
@@ -120,7 +135,7 @@ def _is_unchecked(calibration: Calibration, e: Evidence) -> bool:
 
     Each gives two conditions on the entries of A.
     """
-    spare = 2 * e.poses - int(free_entries(calibration)[:5].sum())
+    spare = 2 * e.repeated.n_poses - int(free_entries(calibration)[:5].sum())
     flat = calibration.type in (1, 2) and bool(np.isnan(e.coverage.relief))
     return flat and spare < (2 if CORRELATED.grade(e.correlation) else 1)
 
@@ -141,14 +156,15 @@ def _redundancy(calibration: Calibration) -> Iterator[Finding]:
 
 def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     spread, diagonal = pixel_spread(calibration.points), image_diagonal(calibration.points)
+    rmse = calibration.rmse_px
     yield (
-        ERROR.grade(e.rmse_px / diagonal),
-        f"the rms reprojection error of {e.rmse_px:.3g} px is large",
+        ERROR.grade(rmse / diagonal),
+        f"the rms reprojection error of {rmse:.3g} px is large",
         "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
     )
     # Given poses that are wrong leave such errors as well, so they are not excused.
     flexes = calibration.target is not None and calibration.type != 4 and _by_flexing(e, diagonal)
-    unexcused = e.rmse_px > EXACT * spread and not flexes
+    unexcused = rmse > EXACT * spread and not flexes
     if unexcused:
         yield (
             CONTRADICTION.grade(e.contradiction),
@@ -157,12 +173,11 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "check that all views are of one camera at one zoom and focus, that the target has the true "
             "shape, and that given parameters are right",
         )
-    if e.rmse_px > ROUNDED * spread:
+    if rmse > ROUNDED * spread:
         # Too few data make the standard deviations large, which are judged by themselves.
         yield (
-            int(e.held_out_px > ELSEWHERE.good * e.rmse_px),
-            f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data "
-            f"{e.rmse_px:.3g} px",
+            int(e.held_out_px > ELSEWHERE.good * rmse),
+            f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data {rmse:.3g} px",
             "add points and views",
         )
         yield (
@@ -195,13 +210,13 @@ def _unexplained(calibration: Calibration, e: Evidence) -> str:
 
 def _explains(calibration: Calibration, e: Evidence) -> bool:
     """Whether causes are known that explain the error."""
-    error = e.rmse_px / image_diagonal(calibration.points)
+    error = calibration.rmse_px / image_diagonal(calibration.points)
     return e.contest is not None and explains(e.contest, e.contradiction, error)
 
 
 def _by_flexing(e: Evidence, diagonal: float) -> bool:
     """Whether a board that bends from view to view may cause the error above the noise floor."""
-    above = float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
+    above = float(np.sqrt(max(e.calibration.rmse_px**2 - e.precision_px**2, 0.0)))
     return above < DISPLACED.good * diagonal and not _is_unknown(e)
 
 
@@ -215,14 +230,14 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         calibration, e.mistake is not None or (e.contest is not None and e.contest.of_outliers)
     )
     yield from e.noise
-    if e.repeated:
+    if copies := repeated_views(calibration.points):
         twice = "the rows are given twice, in the view itself or in another one"
-        yield 1, f"{name_some(e.repeated)}: {twice}", "give each view once"
-    views = len(calibration.views)
-    if e.poses < min(views, _FEW_POSES):
+        yield 1, f"{name_some(copies)}: {twice}", "give each view once"
+    views, poses = len(calibration.views), e.repeated.n_poses
+    if poses < min(views, _FEW_POSES):
         yield (
             1,
-            f"{views} views show only {e.poses} different pose{'s' * (e.poses != 1)}; views that repeat a "
+            f"{views} views show only {poses} different pose{'s' * (poses != 1)}; views that repeat a "
             "pose count as one",
             "add views of other poses instead of more frames of the same ones",
         )
@@ -234,10 +249,10 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             f"with a probability of up to {likely:.2g}; the std of these poses cover both",
             "bring the target nearer, tilt it more, or use one that is not flat; the file has both poses",
         )
-    if e.mirrored:
+    if mirrored := seen_from_behind(e.views, e.state):
         yield (
             1,
-            f"{name_some(e.mirrored)}: the target is mirrored",
+            f"{name_some(mirrored)}: the target is mirrored",
             "check the order of the points in these views",
         )
 

@@ -6,7 +6,7 @@ matplotlib is imported only when a picture is drawn.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import partial
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import CameraEvaluation, evaluate_camera
-from neurocal_cli.calibration.verdict.assessment import gather_evidence
-from neurocal_cli.calibration.verdict.measures import Evidence
+from neurocal_cli.calibration.verdict.evidence import evidence_of
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -75,13 +74,6 @@ class Subject:
     def image_size(self) -> tuple[int, int] | None:
         """(width, height) [px], if known."""
         return self.points.image_size or self.camera.image_size
-
-    @cached_property
-    def evidence(self) -> Evidence | None:
-        """Evidence for the quality of the calibration from its points; None without a calibration."""
-        if self.calibration is None or not len(self.calibration.points):
-            return None
-        return gather_evidence(self.calibration)
 
 
 def set_image(axes: Axes, subject: Subject) -> Array:
@@ -198,7 +190,8 @@ def draw_coverage(axes: Axes, subject: Subject) -> None:
 
 def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     """Draw the standard deviation of projected pixels over the image, at the points' median distance."""
-    projection = None if subject.evidence is None else subject.evidence.projection
+    evidence = None if subject.calibration is None else evidence_of(subject.calibration)
+    projection = None if evidence is None else evidence.projection
     if projection is None or not np.isfinite(projection.std[1]).any():
         style(axes, "Uncertainty")
         say(axes, "known only of a calibration whose image size is known")

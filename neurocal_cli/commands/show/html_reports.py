@@ -11,7 +11,7 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import predict
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
+from neurocal_cli.calibration.verdict.evidence import evidence_of
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import in_plane
@@ -271,7 +271,8 @@ def _measurements(calibration: Calibration) -> str:
 
 def _uncertainty(calibration: Calibration) -> str:
     """Draw a map of the standard deviation of projected pixels at the points' median distance."""
-    found = uncertainty_over_image(calibration)
+    evidence = evidence_of(calibration)
+    found = None if evidence is None else evidence.projection
     if found is None or calibration.image_size is None:
         return ""
     rows = len(np.unique(found.pixels[:, 1]))

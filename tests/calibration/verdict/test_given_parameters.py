@@ -16,7 +16,7 @@ from support.targets import photographed
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, calibrate
-from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, rotation_step
@@ -60,7 +60,7 @@ def test_a_camera_that_is_given_truly_is_within_five_standard_deviations(trials:
         scene = random_flat_set(rng, n, False, cols=int(rng.integers(5, 10)), rows=6)
         found = calibrate(scene.points(noise, rng), **scene.given(3))
         # None is held for a negligible error, such as 0.08 px of an image of 3200 px.
-        held = gather_evidence(found).contest
+        held = Evidence(found).contest
         assert held is None or not any(one.rival.of_given for one in held.causes)
 
 

@@ -23,8 +23,8 @@ from support.wrong_inputs import by_rolling_shutter, of_cameras
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.calibration.verdict import contest as rules_of_contest
 from neurocal_cli.calibration.verdict import effects
-from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.contest import Contest
+from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.rival import Estimate
 from neurocal_cli.camera.geometry import Array
@@ -38,7 +38,7 @@ def reasons(calibration: Calibration) -> str:
 
 
 def held(calibration: Calibration) -> Contest:
-    found = gather_evidence(calibration).contest
+    found = Evidence(calibration).contest
     assert found is not None
     return found
 

@@ -17,8 +17,8 @@ from support.targets import board, views_of
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
-from neurocal_cli.calibration.verdict.assessment import assess, gather_evidence
-from neurocal_cli.calibration.verdict.rules import reach_verdict
+from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.calibration.verdict.rules import assess, reach_verdict
 from neurocal_cli.files.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.files.result_files import write_calibration
 
@@ -43,9 +43,7 @@ def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, dept
 def test_the_projection_uncertainty_is_that_of_many_calibrations(lens: str, trials: int) -> None:
     scene, _ = bent_set(lens, 12)
     truth = calibrate(scene.points(), distortion=lens, skew=False, outliers="keep")
-    told = gather_evidence(
-        calibrate(noisy(scene, 0), distortion=lens, skew=False, outliers="keep")
-    ).projection
+    told = Evidence(calibrate(noisy(scene, 0), distortion=lens, skew=False, outliers="keep")).projection
     assert told is not None
     squared = np.zeros((len(told.depths), len(told.pixels)))
     for trial in range(trials):
@@ -65,7 +63,7 @@ def noisy(scene: Scene, trial: int):
 @pytest.mark.slow
 def test_halves_of_good_data_agree_as_their_deviations_say() -> None:
     scene = random_flat_set(np.random.default_rng(4), 8, False)
-    values = [gather_evidence(pinhole(noisy(scene, trial), skew=False)).disagreement for trial in range(40)]
+    values = [Evidence(pinhole(noisy(scene, trial), skew=False)).disagreement for trial in range(40)]
     assert np.mean(values) == pytest.approx(1.0, abs=0.4)
 
 
@@ -79,7 +77,7 @@ def test_the_error_on_data_left_out_is_that_on_new_data() -> None:
         scene = random_flat_set(np.random.default_rng([seed, 1]), 12, False, cols=8, rows=6)
         points = noisy(scene, seed)
         camera = pinhole(points.select(points.view_index < 6), skew=False)
-        told.append(gather_evidence(camera).held_out_px)
+        told.append(Evidence(camera).held_out_px)
         found.append(evaluate_camera(camera, points.select(points.view_index >= 6)).rmse_px)
     assert np.mean(told) == pytest.approx(np.mean(found), rel=0.03)
 
@@ -112,7 +110,7 @@ def test_few_views_on_one_side_of_the_image_are_told_where_to_add_some() -> None
 
 def test_a_calibration_without_an_image_size_is_judged_without_the_image() -> None:
     found = calibrate(replace(flat(6), image_size=None))
-    evidence = gather_evidence(found)
+    evidence = Evidence(found)
     assert evidence.projection is None
     assert np.isnan(evidence.coverage.image)
     assert assess(found).word == "good"
@@ -141,11 +139,12 @@ def test_a_board_that_flexes_does_not_excuse_two_cameras() -> None:
     """An error above the noise floor as of a board held by hand; halves of the views agree or do not."""
     cal = calibrate(read_points(str(BENT)), skew=False)
     assert cal.target is not None
-    measured = gather_evidence(cal)
-    floor = measured.rmse_px / 1.5
-    flexing = replace(measured, precision_px=floor, contradiction=1.5, disagreement=4.0, correlation=0.0)
-    assert reach_verdict(cal, flexing).reasons == cal.verdict.reasons
-    (first, *_) = reach_verdict(cal, replace(flexing, disagreement=18.0)).reasons
+    measured = Evidence(cal)
+    told = {"_precision": (cal.rmse_px / 1.5, 1.5), "disagreement": 4.0, "correlation": 0.0}
+    vars(measured).update(told)
+    assert reach_verdict(measured).reasons == cal.verdict.reasons
+    vars(measured).update(disagreement=18.0)
+    (first, *_) = reach_verdict(measured).reasons
     assert first.startswith("the results of two halves of the data differ by 4.2 times as much")
 
 

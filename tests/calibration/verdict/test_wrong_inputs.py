@@ -10,7 +10,7 @@ from support.wrong_inputs import CAUSES, FLAT, FOLDED, SIZE, SLOW, UNNAMED, flat
 from wrong_inputs_table import words
 
 from neurocal_cli import calibrate
-from neurocal_cli.calibration.verdict.assessment import assess
+from neurocal_cli.calibration.verdict.rules import assess
 
 ROWS = words()
 # What is said of views that differ: one of these, or none.

@@ -1,6 +1,6 @@
-"""Measure the quality of a calibration beyond its reprojection error, and reach a verdict.
+"""`Evidence`: what the points of a calibration tell of its quality and its uncertainty.
 
-All measures (`Evidence`) are computed from the calibration and its points, so a file can be judged like a
+All is computed, when it is first read, from the calibration and its points, so a file can be judged like a
 fresh result.
 """
 
@@ -24,16 +24,17 @@ from neurocal_cli.adjustment.cross_validation import (
     disagreement,
     held_out,
     inverse_or_nan,
+    quietly,
     reduced,
 )
-from neurocal_cli.adjustment.free_networks import conditions_on_views, free_networks, seen_from_behind
+from neurocal_cli.adjustment.free_networks import conditions_on_views, free_networks
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.problem import normalised, problem_for
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.views import Views, arrange
-from neurocal_cli.calibration.calibration import Calibration, Verdict, estimated_parameters, free_entries
+from neurocal_cli.calibration.calibration import Calibration, estimated_parameters, free_entries
 from neurocal_cli.calibration.verdict.contest import Contest, contest, given_camera
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
@@ -43,21 +44,18 @@ from neurocal_cli.calibration.verdict.findings import (
     Finding,
     log_odds,
     pixel_spread,
-    verdict_of,
 )
 from neurocal_cli.calibration.verdict.measures import (
-    Evidence,
+    Coverage,
     ProjectionUncertainty,
     cover,
     image_grid,
-    pixel_covariance,
     projection_uncertainty,
 )
 from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.calibration.verdict.odd_points import OUTLIERS, repeated_views, with_rejected
+from neurocal_cli.calibration.verdict.odd_points import OUTLIERS, with_rejected
 from neurocal_cli.calibration.verdict.proportions import unlike_axes
-from neurocal_cli.calibration.verdict.rules import reach_verdict
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import (
@@ -66,11 +64,10 @@ from neurocal_cli.camera.distortion import (
     coefficient_names,
     pinhole_coefficients,
 )
-from neurocal_cli.camera.geometry import Array, cross_matrix, median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import std_of_scale
 
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _DISPLACED = "k1k2"  # the model instead of a rich lens
@@ -78,94 +75,17 @@ _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plan
 _DISTANT = 10.0  # times the distance of the farthest point
 
 
-# In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def gather_evidence(calibration: Calibration, causes: bool = True) -> Evidence:
-    """Compute all measures of the quality of a calibration, which has its points, and look for `causes`."""
-    return _AtMinimum(calibration).evidence(causes)
+def evidence_of(calibration: Calibration) -> Evidence | None:
+    """The evidence of a calibration; None if it has no points of its own, or some are behind the camera."""
+    return None if not has_points(calibration) or views_behind(calibration) else Evidence(calibration)
 
 
-def assess(calibration: Calibration, causes: bool = True) -> Verdict | None:
-    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own.
-
-    `causes` tells whether causes of the residuals are looked for.
-    """
-    if not _has_points(calibration):
-        return None
-    behind = _views_behind(calibration)
-    if behind:
-        reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
-        return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
-    return reach_verdict(calibration, gather_evidence(calibration, causes))
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | None:
-    """Uncertainty of projected pixels over the image; None without points or image size."""
-    if not _has_points(calibration) or _views_behind(calibration):
-        return None
-    return _AtMinimum(calibration).projection()
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def camera_and_covariance(calibration: Calibration) -> tuple[Camera, Array]:
-    """The camera, and the covariance (5 + K, 5 + K) of A's entries [px] and its coefficients.
-
-    Given ones have none. With points of its own, the camera has the coefficients that the selection of its
-    distortion model leaves open, too, so that the covariance includes the uncertainty of that choice.
-    """
-    c = calibration
-    if not _has_points(c) or _views_behind(c):
-        return c.camera, entry_covariance(c.intrinsics, c.distortion_model, *c.known_covariance, 1.0)
-    found = _AtMinimum(c)
-    m, camera, shared = found.opened()
-    whole = np.zeros((len(m.free), len(m.free)))
-    whole[np.ix_(m.free, m.free)] = shared
-    if m.state.square:  # A22 is A11
-        whole[2], whole[:, 2] = whole[0], whole[:, 0]
-        whole[2, 2] = whole[0, 0]
-    to_pixels = np.array([found.views.pixel_scale] * 5 + [1.0] * (len(m.free) - 5))
-    return camera, to_pixels[:, None] * whole * to_pixels
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def pixel_covariance_of(calibration: Calibration, points: Array, view: str | None) -> Array | None:
-    """Covariance (N, 2, 2) [px^2] of the pixels of points (N, 3) in the camera's frame.
-
-    None if the calibration has no points of its own. See `pixel_covariance`.
-    """
-    if not _has_points(calibration) or _views_behind(calibration):
-        return None
-    at = _AtMinimum(calibration)
-    m, camera, shared = at.opened()
-    return pixel_covariance(m, camera, at.variance, points, shared, view)
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def position_covariance_of(calibration: Calibration, view: str) -> Array | None:
-    """Covariance (3, 3) of the camera's centre -R^T t in the coordinates of a view's target [world unit^2].
-
-    None if the calibration has no points of its own. A step (w, d) of the pose about the target's centre
-    moves it by -s R^T (d + tau x w).
-    """
-    if not _has_points(calibration) or _views_behind(calibration):
-        return None
-    if calibration.views[view].fixed:
-        return np.zeros((3, 3))
-    at = _AtMinimum(calibration)
-    k = at.views.names.index(view)
-    R, tau = at.state.R[k], at.state.t[k]
-    M = -at.views.scale[k] * R.T @ np.hstack([cross_matrix(tau), np.eye(3)])
-    pose = calibration.pose_of(view)
-    of_scale = std_of_scale(calibration.points, calibration.target) * (pose.R.T @ pose.t)
-    return np.asarray(M @ at.pose_covariance[k] @ M.T + np.outer(of_scale, of_scale))
-
-
-def _has_points(calibration: Calibration) -> bool:
+def has_points(calibration: Calibration) -> bool:
+    """Whether a calibration has points of all its views."""
     return bool(calibration.views) and set(calibration.points.view_names) == set(calibration.views)
 
 
-def _views_behind(calibration: Calibration) -> int:
+def views_behind(calibration: Calibration) -> int:
     """Number of views with points behind the camera or in its plane, according to their stored poses.
 
     For a wide lens: with points outside the domain of its model.
@@ -180,11 +100,16 @@ def _views_behind(calibration: Calibration) -> int:
     return int(np.count_nonzero(np.bincount(view[~seen])))  # np.unique would load numpy.ma
 
 
-class _AtMinimum:
-    """A calibration in normalised units, adjusted to its minimum."""
+class Evidence:
+    """What its points tell of a calibration, adjusted to its minimum and in normalised units.
 
-    def __init__(self, calibration: Calibration) -> None:
-        self.calibration, self.points = calibration, calibration.points
+    `causes` tells whether causes of the residuals are looked for.
+    """
+
+    # In an edited file, points may lie in the camera's plane; all measures may then be inf or nan.
+    @quietly
+    def __init__(self, calibration: Calibration, causes: bool = True) -> None:
+        self.calibration, self.points, self.causes = calibration, calibration.points, causes
         views = [calibration.views[name] for name in self.points.view_names]
         self.camera, self.given = calibration.camera, calibration.state(self.points.view_names)
         self.views = self._arranged(self.points)
@@ -234,38 +159,32 @@ class _AtMinimum:
             return arrange(points)
         return weighed(points, -self._residuals())
 
-    def evidence(self, causes: bool) -> Evidence:
-        """All measures that the rules use."""
-        views = self.views
-        precision, contradiction = self._precision()
-        alike, residuals = correlation(views, self.errors), self._residuals()
-        stated = tuple(stated_noise(self.points, residuals, alike))
-        return Evidence(
-            rmse_px=self.calibration.rmse_px,
-            held_out_px=self._held_out(),
-            precision_px=precision,
-            contradiction=contradiction,
-            disagreement=self._disagreement(),
-            correlation=alike,
-            condition=self.condition,
-            coverage=cover(self.points, views, self.state),
-            projection=self.projection(),
-            repeated=repeated_views(self.points),
-            poses=self.repeated.n_poses,
-            # Sigmas that are wrong give single points the weight that all this is computed with.
-            contest=self._contest() if causes and not stated else None,
-            of_given=tuple(self._of_given()),
-            mirrored=tuple(seen_from_behind(views, self.state)),
-            noise=(*stated, *self._survey(), *noise_shape(self.points, residuals, alike)),
-            stated=bool(stated),
-            mistake=self._mistake(contradiction),
-            lacking=self._lacking(),
-        )
+    @cached_property
+    def correlation(self) -> float:
+        """Correlation of neighbouring residuals; 0 for noise."""
+        return correlation(self.views, self.errors)
 
-    def _lacking(self) -> tuple[str, float]:
-        """The parameter that real lenses leave most uncertain beside a named one; see `Evidence`.
+    @cached_property
+    def coverage(self) -> Coverage:
+        """How the points cover the image and the space before the camera."""
+        return cover(self.points, self.views, self.state)
 
-        Its standard deviation is compared with that for a lens that was selected.
+    @cached_property
+    def stated(self) -> tuple[Finding, ...]:
+        """Residuals that contradict the stated standard deviations of the pixels."""
+        return tuple(stated_noise(self.points, self._residuals(), self.correlation))
+
+    @property
+    def noise(self) -> tuple[Finding, ...]:
+        """Residuals unlike measurement noise, or that contradict the stated noise."""
+        shape = noise_shape(self.points, self._residuals(), self.correlation)
+        return (*self.stated, *self._survey(), *shape)
+
+    @property
+    def lacking(self) -> tuple[str, float]:
+        """The parameter whose std grows most with what a named lens lacks, and by which factor.
+
+        The points leave open what it lacks. The std is compared with that for a lens that was selected.
         """
         c = self.calibration
         names = coefficient_names(c.distortion_model)
@@ -296,11 +215,14 @@ class _AtMinimum:
         return self.calibration.rmse_px < ROUNDED * pixel_spread(self.points)
 
     @cached_property
-    def networks(self) -> Array:
+    def _networks(self) -> Array:
         """(V,) squared error of a free network for each view."""
         return free_networks(self.views, self.state)
 
-    def _held_out(self) -> float:
+    @cached_property
+    @quietly
+    def held_out_px(self) -> float:
+        """Five-fold cross-validation error; nan if no data can be left out."""
         lost = self._held_out_with_prior() if self.state.model == "rich" else held_out(self.minimum)
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, NOTHING)))
 
@@ -317,21 +239,42 @@ class _AtMinimum:
         steps = np.linalg.solve(inverse @ S - np.eye(len(shared)), (g @ inverse)[..., None])[..., 0]
         return q.at(np.asarray(steps[fold], dtype=float))
 
+    @property
+    def precision_px(self) -> float:
+        """Noise floor: rms error of a free network for each view, corrected for degrees of freedom.
+
+        nan if the networks are no freer than the camera.
+        """
+        return self._precision[0]
+
+    @property
+    def contradiction(self) -> float:
+        """Rms error, corrected likewise, over the noise floor; 1 for noise alone."""
+        return self._precision[1]
+
+    @cached_property
+    @quietly
     def _precision(self) -> tuple[float, float]:
         freedom = 6 + conditions_on_views(self.views, self.state)
         own_spare = self.views.n_equations - int(freedom.sum())
         if own_spare < SPARE[0] or freedom.sum() <= self.unknowns:
             return np.nan, np.nan
-        own = float(self.networks.sum()) / own_spare
+        own = float(self._networks.sum()) / own_spare
         px = self.views.pixel_scale
         floor = (1e-9 * px) ** 2
         ratio = np.sqrt((self.variance + floor) / (own + floor))
         of_point = self.views.n_equations / len(self.points)
         return float(np.sqrt(of_point * own)) * px, float(ratio)
 
-    def _contest(self) -> Contest | None:
-        """The causes of the residuals; with outliers, if one that all views share explains most of them."""
-        if self._is_exact():
+    @cached_property
+    @quietly
+    def contest(self) -> Contest | None:
+        """The causes of the residuals; with outliers, if one that all views share explains most of them.
+
+        None where a mistake explains them.
+        """
+        # Sigmas that are wrong give single points the weight that all this is computed with.
+        if not self.causes or self.stated or self.mistake or self._is_exact():
             return None
         kept = self._contest_at(self.views, self.state)
         if self.calibration.rejected.points is None or self.calibration.target is not None:
@@ -361,7 +304,9 @@ class _AtMinimum:
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
         return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
 
-    def _of_given(self) -> list[Finding]:
+    @property
+    @quietly
+    def of_given(self) -> list[Finding]:
         """What the points say against a given centre that the lens or the target hides.
 
         The poses absorb a wrong centre, and tangential distortion, a rich lens or the shape of the target the
@@ -406,17 +351,21 @@ class _AtMinimum:
         _, adjusted = fit if found is None else found.fits[0]
         return np.asarray(adjusted.state.entries[0, 3:] - state.entries[0, 3:])
 
-    def _mistake(self, contradiction: float) -> tuple[str, str] | None:
+    @cached_property
+    def mistake(self) -> tuple[str, str] | None:
         """A mistake in all views, and what to do, if they contradict each other or lost points."""
         found, lost = None, self.calibration.rejected.points
         if lost is not None and OUTLIERS.grade(len(lost) / (len(lost) + len(self.points))):
             found = mistake_in_all_views(with_rejected(self.calibration))
         given = self.calibration.target is None and self.calibration.type in (1, 2)
-        if found or not given or self._is_exact() or not contradiction > CONTRADICTION.good:
+        if found or not given or self._is_exact() or not self.contradiction > CONTRADICTION.good:
             return found
         return unlike_axes(self.points)
 
-    def _disagreement(self) -> float:
+    @cached_property
+    @quietly
+    def disagreement(self) -> float:
+        """Chi-squared per parameter of the difference between two halves of the data; 1 if the std hold."""
         if not self.free.any() or self.calibration.straight_lines is not None:
             return np.nan
         difference, cov = disagreement(self.minimum)
@@ -428,8 +377,13 @@ class _AtMinimum:
         cov = self.variance * cov + 4 * (vectors * np.maximum(values, 0.0)) @ vectors.T
         return chi_squared(difference, cov) / len(difference)
 
+    @cached_property
+    @quietly
     def projection(self) -> ProjectionUncertainty | None:
-        """Uncertainty of projected pixels over the image; None if its size is unknown."""
+        """Uncertainty of projected pixels over the image; None if its size is unknown.
+
+        It is that at the distances of the nearest, median and farthest point, and at ten times the farthest.
+        """
         if self.points.image_size is None:
             return None
         view = self.points.view_index
@@ -445,6 +399,7 @@ class _AtMinimum:
         pixels = image_grid(self.points.image_size)
         return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
 
+    @quietly
     def opened(self) -> tuple[Minimum, Camera, Array]:
         """The minimum and the camera, with the coefficients that the selection of its model leaves open.
 
