@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig as calibrate_rig
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo as calibrate_stereo
     from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo as fit_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_rig as evaluate_rig
     from neurocal_cli.calibration.rig.evaluation import evaluate_stereo as evaluate_stereo
     from neurocal_cli.calibration.rig.evaluation import evaluate_stereo_rig as evaluate_stereo_rig
     from neurocal_cli.calibration.rig.many_views import triangulate_many as triangulate_many
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rig import StereoRig as StereoRig
     from neurocal_cli.calibration.rig.rig_drift import RigDrift as RigDrift
     from neurocal_cli.calibration.rig.rig_drift import find_rig_drift as find_rig_drift
-    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig as evaluate_rig
     from neurocal_cli.calibration.rig.triangulation import triangulate as triangulate
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens as evaluate_lens
     from neurocal_cli.calibration.zoom.fit import LensCameras as LensCameras
@@ -103,7 +103,7 @@ _HOMES = {
     "camera_at": "calibration.zoom.zoom_lens",
     "detect_points": "detection.detect",
     "evaluate_camera": "calibration.evaluation",
-    "evaluate_rig": "calibration.rig.rig_evaluation",
+    "evaluate_rig": "calibration.rig.evaluation",
     "evaluate_lens": "calibration.zoom.evaluation",
     "evaluate_stereo_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",

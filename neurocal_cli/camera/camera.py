@@ -173,25 +173,6 @@ class Camera:
         rays = self.unproject(pixels)
         return rays if self.distortion.wide else np.asarray(rays / rays[..., 2:])
 
-    def unproject_jacobian(self, pixels: Array) -> tuple[Array, Array]:
-        """Derivatives of the rays of pixels (N, 2).
-
-        Returns
-        -------
-        by_camera : (N, 3, 5 + K) array
-            By A11, A12, A22, A13, A23 and the coefficients of the distortion, at the same pixels.
-        by_pixel : (N, 3, 2) array
-        """
-        rays = self.unproject(pixels)
-        # A unit ray r moves only perpendicular to itself, and J dr = dm with the Jacobian J of `project`.
-        by_camera, by_point = self.project_jacobian(rays)
-        along = rays[:, None, :]
-        square = np.concatenate([by_point, along], axis=1)
-        by_pixel = np.full((len(rays), 3, 2), np.nan)
-        seen = np.isfinite(rays[:, 0])
-        by_pixel[seen] = np.linalg.inv(square[seen])[:, :, :2]
-        return -by_pixel @ by_camera, by_pixel
-
     def rescaled(self, scale: float | tuple[float, float]) -> Camera:
         """The camera of resized images: ``u' = (u + 1/2) s - 1/2``.
 

@@ -348,7 +348,7 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
 
     named = [named_file(word) for word in points]
     preparation.check((file, *(name for _, name in named)))
-    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
+    from neurocal_cli.calibration.rig.evaluation import evaluate_rig
     from neurocal_cli.commands.show.camera_report import plane_report
     from neurocal_cli.commands.show.rig_report import rig_evaluation_report
     from neurocal_cli.files.rig_points import read_rig_points
@@ -357,8 +357,7 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     found = read_rig(file)
     given = noted(read_rig_points, named) if named else None
     evaluation, space = evaluate_rig(found, given), _errors_at(at, found)
-    if evaluation.n_behind:
-        warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")
+    warn(*evaluation.warnings)
     (rig_evaluation_report(evaluation) | plane_report(space, evaluation.unit)).print(as_json)
     if not as_json:
         suggest(file, "neurocal report {} -o report.html")

@@ -233,23 +233,6 @@ def test_project_jacobian_by_central_differences(model: str, theta: float) -> No
     np.testing.assert_allclose(by_camera, numeric, rtol=1e-6, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("model", "theta"),
-    slow_but(
-        [(model, 1.5) for model in MODELS if model != "rich"], itertools.product(MODELS, (np.pi / 2, 1.5))
-    ),
-)
-def test_unproject_jacobian_by_central_differences(model: str, theta: float) -> None:
-    camera, pixels = camera_with(model, theta), some_pixels()
-    by_camera, by_pixel = camera.unproject_jacobian(pixels)
-    numeric = slopes(camera.unproject, pixels, np.full(2, 1e-3))
-    np.testing.assert_allclose(by_pixel, numeric, rtol=1e-6, atol=1e-9)
-    values = np.array([*camera.entries, *camera.distortion.coefficients])
-    steps = np.array([1e-2] * 5 + [1e-5] * (len(values) - 5))
-    numeric = slopes(lambda v: with_parameters(camera, v).unproject(pixels), values, steps)
-    np.testing.assert_allclose(by_camera, numeric, rtol=1e-5, atol=1e-8)
-
-
 @every_model
 @with_and_without_skew
 def test_unproject_inverts_project(model: str, theta: float) -> None:
@@ -264,10 +247,6 @@ def test_a_pixel_that_the_camera_cannot_see_has_no_ray() -> None:
     camera = Camera(Intrinsics(100.0, 100.0, 0.0, 0.0), Distortion("k1", [-1.0]))
     rays = camera.unproject(np.array([[30.0, 0.0], [50.0, 0.0]]))  # the image ends at 38.5
     assert np.isfinite(rays).all(axis=1).tolist() == [True, False]
-    assert np.isfinite(camera.unproject_jacobian(np.array([[30.0, 0], [50, 0]]))[1][:, 0, 0]).tolist() == [
-        True,
-        False,
-    ]
 
 
 # Other images of the same camera

@@ -15,7 +15,8 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate, read_calibration, write_calibration, write_points
 from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
-from neurocal_cli.calibration.rig.evaluation import SpaceError, evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.files.result_files import write_rig
 
 

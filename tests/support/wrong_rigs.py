@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate, fit_stereo
+from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.camera.geometry import Array, rotation_step, rotation_vector
 from neurocal_cli.errors import NeurocalError
@@ -307,7 +308,7 @@ def judged(points: Points) -> Outcome:
     """Calibrate two cameras and their rig, and judge it."""
     try:
         left, right = (_alone(side) for side in points)
-        rig = fit_stereo(left, right, refine_cameras=True)
+        rig = fit_rig({"left": left, "right": right}, refine_cameras=True).pair("left", "right")
     except NeurocalError as error:
         return Outcome("refused", (str(error),))
     verdict = rig.verdict

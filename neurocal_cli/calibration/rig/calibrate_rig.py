@@ -28,7 +28,7 @@ from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, TargetChoice
 
-_SIDES = ("left", "right")
+SIDES = ("left", "right")
 
 
 _ROUNDS = 2  # rounds of selecting lenses and target alternately
@@ -277,32 +277,15 @@ def calibrate_stereo(
     InputError, DegenerateGeometryError
         The points do not determine the rig; the message says why.
     """
-    extra = dict(zip(_SIDES, (left_options or {}, right_options or {}), strict=True))
-    points = dict(zip(_SIDES, (left, right), strict=True))
+    extra = dict(zip(SIDES, (left_options or {}, right_options or {}), strict=True))
+    points = dict(zip(SIDES, (left, right), strict=True))
     return _stereo(calibrate_rig(points, extra, progress=progress, **options))
 
 
-def fit_stereo(
-    left: Calibration,
-    right: Calibration,
-    *,
-    refine_cameras: bool = False,
-    outliers: str = "reject",
-) -> StereoRig:
+def fit_stereo(left: Calibration, right: Calibration) -> StereoRig:
     """Find the pose of the right camera relative to the left one from the views of both.
 
-    Parameters
-    ----------
-    left, right : Calibration
-    refine_cameras : bool
-        Whether the bundle adjustment also refines the intrinsic parameters and distortions that were
-        estimated. Otherwise it refines the rig and the poses alone.
-    outliers : {"reject", "keep"}
-        Whether pairs of views that contradict most others are left out of the rig with a warning, or raise.
-
-    Returns
-    -------
-    StereoRig
+    The cameras stay as they are. Pairs of views that contradict most others are left out, with a warning.
 
     Raises
     ------
@@ -312,15 +295,12 @@ def fit_stereo(
         Views that contradict each other.
     CoincidentCamerasError
         Cameras at one place.
-    UsageError
-        An unknown option.
     """
-    cameras = dict(zip(_SIDES, on_one_target(left, right), strict=True))
-    return _stereo(fit_rig(cameras, refine_cameras=refine_cameras, outliers=outliers))
+    return _stereo(fit_rig(dict(zip(SIDES, on_one_target(left, right), strict=True))))
 
 
 def _stereo(rig: Rig) -> StereoRig:
-    pair = rig.pair(*_SIDES)
+    pair = rig.pair(*SIDES)
     return replace(pair, warnings=(*pair.warnings, *_swapped(pair)))
 
 

@@ -58,9 +58,11 @@ def fit_rig(
 ) -> Rig:
     """Find the poses of cameras on one target, by name, relative to the first one, from the views of all.
 
-    It is `fit_stereo` for any number of cameras, with the same options and errors. Their frames are as
-    `connected_frames` finds them. `target_kept` tells whether the given target was kept although it could
-    have been estimated from all cameras.
+    Their frames are as `connected_frames` finds them, and the errors as those of `fit_stereo`. With
+    `refine_cameras` the bundle adjustment also refines the intrinsic parameters and distortions that were
+    estimated. `outliers` tells whether views that contradict most others are left out with a warning
+    ("reject"), or are an error ("keep"), and `target_kept` whether the given target was kept although it
+    could have been estimated from all cameras.
     """
     if outliers not in ("reject", "keep"):
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")

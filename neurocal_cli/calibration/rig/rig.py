@@ -16,7 +16,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.presented import Presented
-from neurocal_cli.calibration.rig.frames import pair_views, unpaired
+from neurocal_cli.calibration.rig.frames import FrameNames, pair_views, unpaired
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.camera.late_import import late
@@ -253,6 +253,19 @@ class Rig(FixedCameras):
     def unit(self) -> str:
         """Unit of the world coordinates."""
         return self.cameras[self.first].unit
+
+    @property
+    def frame_names(self) -> FrameNames:
+        """The frames of all views of the points; those that determine the rig are the first."""
+        place = {view: k for k, views in enumerate(self.frames.values()) for view in views.items()}
+        names, of_views = list(self.frames), []
+        for camera, one in self.cameras.items():
+            views = [(camera, view) for view in one.points.view_names]
+            alone = [view for view in views if view not in place]
+            place |= {view: len(names) + k for k, view in enumerate(alone)}
+            names += map("/".join, alone)
+            of_views.append(np.array([place[view] for view in views], dtype=np.intp))
+        return FrameNames(tuple(names), tuple(of_views))
 
     @property
     def edges(self) -> dict[tuple[str, str], int]:

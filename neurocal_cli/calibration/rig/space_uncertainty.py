@@ -8,7 +8,6 @@ N = J^T J, summed over the cameras that see it.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,16 +38,7 @@ def has_points(rig: Rig) -> bool:
 
 def fitted(rig: Rig) -> RigFit:
     """The rig at its minimum, with the poses of its cameras and frames as unknowns."""
-    frame_of = {
-        (camera, view): k for k, views in enumerate(rig.frames.values()) for camera, view in views.items()
-    }
-    alone = count(len(rig.frames))
-    of_views = []
-    for name, camera in rig.cameras.items():
-        views = [(name, view) for view in camera.points.view_names]
-        own = [frame_of[view] if view in frame_of else next(alone) for view in views]
-        of_views.append(np.array(own, dtype=np.intp))
-    problem = rig_problem(list(rig.cameras.values()), of_views)
+    problem = rig_problem(list(rig.cameras.values()), rig.frame_names.of_views)
     state = problem.start(list(rig.poses.values())[1:])
     if rig.delays:
         motion = motion_of(problem, state, problem.times if rig.timed else None) or motion_of(

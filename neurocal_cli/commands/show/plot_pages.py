@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.evaluation import SpaceError, StereoEvaluation
+from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.commands.show.camera_panels import (
     Outline,

@@ -29,13 +29,14 @@ from neurocal_cli.commands.show.text import (
 from neurocal_cli.errors import one_line, plural
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.evaluation import SpaceError, StereoEvaluation
-    from neurocal_cli.calibration.rig.rig_evaluation import RigEvaluation
+    from neurocal_cli.calibration.rig.evaluation import RigEvaluation, StereoEvaluation
+    from neurocal_cli.calibration.rig.space_error import SpaceError
 
 _SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_EDGES = 20  # rows of a table that fit on a screen
 _MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
 _NAMED = 10  # views named in a remark
+_AXES = ("X rms", "rmse_x"), ("Y rms", "rmse_y"), ("Z rms", "rmse_z")
 _ERRORS = "n_points n_behind rmse rmse_x rmse_y rmse_z max nsce epipolar_px relative"
 
 
@@ -128,30 +129,29 @@ def rig_json(rig: Rig) -> dict[str, Any]:
 
 def rig_evaluation_report(evaluation: RigEvaluation) -> Report:
     """The errors of all points, of the cameras and of the frames, and the verdict."""
-    unit = one_line(evaluation.unit)
-    x, y, z = evaluation.by_axis.tolist()
+    unit, found = one_line(evaluation.unit), evaluation.rig
+    assert found is not None
     overall = [[f"[{unit}]", "all cameras"]]
-    for label, value in (("X rms", x), ("Y rms", y), ("Z rms", z), ("rms", evaluation.rmse)):
-        overall.append([label, four_digits(value)])
-    overall += [["maximum", four_digits(evaluation.largest)], ["points", str(len(evaluation.errors))]]
+    for label, name in (*_AXES, ("rms", "rmse"), ("maximum", "max")):
+        overall.append([label, four_digits(getattr(found, name))])
+    overall.append(["points", str(found.n_points)])
     cameras = [["camera", "points", "rms from the other cameras' prediction [px]"]]
     for name, (count, error) in evaluation.predicted.items():
         cameras.append([one_line(name), str(count), four_digits(error)])
     frames = [["frame", f"rms [{unit}]"]]
-    worst = sorted(evaluation.frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
+    of_frames = {name: error for name, (_, error) in found.views.items()}
+    worst = sorted(of_frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
     frames += [[one_line(name), four_digits(error)] for name, error in worst]
     tree = {
-        "n_points": len(evaluation.errors),
-        **attributes(evaluation, "n_behind unit rmse"),
-        "rmse_x": x,
-        "rmse_y": y,
-        "rmse_z": z,
-        **attributes(evaluation, "max=largest fitted"),
+        **attributes(found, "n_points n_behind"),
+        "unit": evaluation.unit,
+        **attributes(found, "rmse rmse_x rmse_y rmse_z max"),
+        "fitted": bool(evaluation.fitted),
         "cameras": {
             name: {"n_points": count, "predicted_rmse_px": error}
             for name, (count, error) in evaluation.predicted.items()
         },
-        "frames": evaluation.frames,
+        "frames": of_frames,
         **verdict_json(evaluation.verdict),
     }
     return Report(tree, [overall, cameras, frames], verdict_lines(evaluation.verdict))
@@ -265,8 +265,7 @@ def stereo_evaluation_report(evaluation: StereoEvaluation) -> Report:
         ways, heads = [*ways, evaluation.rig], [*heads, "one rig"]
     overall = [[f"[{unit}]", *heads]]
     for label, name in (
-        ("X rms", "rmse_x"),
-        ("Y rms", "rmse_y"),
+        *_AXES[:2],
         ("Z (depth) rms", "rmse_z"),
         ("rms", "rmse"),
         ("maximum", "max"),

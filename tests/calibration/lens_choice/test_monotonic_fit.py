@@ -14,7 +14,7 @@ from support.slow_cases import slow_but
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.calibration.lens_choice import given_model
 from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit, where_not_monotonic
-from neurocal_cli.calibration.rig.calibrate_rig import fit_stereo
+from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
 from neurocal_cli.camera.geometry import rotation_step
@@ -157,7 +157,7 @@ def test_a_rig_keeps_a_lens_from_folding() -> None:
     right = other.points(SIGMA, np.random.default_rng([38, 5]))
     left = noisy("k1k2", 38)
     cameras = [calibrate(points, distortion="k1k2", skew=False) for points in (left, right)]
-    rig = fit_stereo(cameras[0], cameras[1], refine_cameras=True)
+    rig = fit_rig({"left": cameras[0], "right": cameras[1]}, refine_cameras=True).pair("left", "right")
     lens = Distortion("k1k2", rig.left.distortion)
     assert where_not_monotonic(lens, rig.left.K, cameras[0].points) is None
     assert any("the distortion model k1k2 of the left camera" in text for text in rig.warnings)

@@ -35,7 +35,7 @@ def rig_of(n: int, distance: float, seed: int) -> StereoRig:
         for side in sides
     ]
     assert all(camera.second_poses for camera in cameras)
-    return fit_stereo(*cameras, refine_cameras=False)
+    return fit_stereo(*cameras)
 
 
 def test_no_pair_is_left_out_for_its_second_pose() -> None:
@@ -63,7 +63,7 @@ def test_a_reported_rig_of_a_small_board_is_whole(real_files: RealFiles) -> None
     camera = Camera(Intrinsics(1000.0, 1000.0, 640.0, 400.0), image_size=(1280, 800))
     sides = [calibrate(side, type=3, intrinsics=camera) for side in (left, right)]
     assert all(side.second_poses for side in sides)
-    assert not fit_stereo(*sides, refine_cameras=False).left_out
+    assert not fit_stereo(*sides).left_out
 
 
 def test_the_scale_of_a_reported_rig_of_a_wrongly_described_grid_is_unknown(real_files: RealFiles) -> None:

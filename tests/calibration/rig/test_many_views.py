@@ -134,12 +134,14 @@ def test_a_rig_is_evaluated_on_its_own_and_on_new_points() -> None:
     rig = calibrate_rig(points, skew=False, distortion="k1", target="given")
     own = evaluate_rig(rig)
     assert not own.fitted
-    assert own.rmse < 8
+    assert own.rig is not None
+    assert own.rig.rmse < 8
     assert all(0.2 < error < 1.5 and count > 300 for count, error in own.predicted.values())
     new = truth.points(0.3, np.random.default_rng(99))
     other = evaluate_rig(rig, {name: one for name, one in new.items() if name != "cam1"})
     assert other.fitted
-    assert other.rmse < 9
+    assert other.rig is not None
+    assert other.rig.rmse < 9
     assert other.predicted["cam1"][0] == 0
     assert other.verdict is not None
     assert rig.verdict is not None

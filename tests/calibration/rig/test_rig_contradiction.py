@@ -11,12 +11,13 @@ from support.rigs import RigScene, random_rig, stereo_problem
 from support.slow_cases import slow_but
 from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
-from neurocal_cli import Correspondences, calibrate, fit_stereo
+from neurocal_cli import Correspondences, calibrate
 from neurocal_cli.adjustment.covariance import not_smaller
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
 from neurocal_cli.calibration.rig.causes import Named, named_cause
 from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.edges import RelativePoses, odd_pairs, relative_poses
+from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import pair_views
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.rig import StereoRig
@@ -54,7 +55,7 @@ def told(points: Points) -> str:
 
 def fitted(points: Points) -> StereoRig:
     left, right = (calibrate(side, distortion="none", skew=False) for side in points)
-    return fit_stereo(left, right, refine_cameras=True)
+    return fit_rig({"left": left, "right": right}, refine_cameras=True).pair("left", "right")
 
 
 def test_the_vector_of_a_rotation_leads_back_to_it() -> None:
@@ -129,7 +130,7 @@ def test_a_rig_that_moved_is_refused_if_nothing_may_be_left_out() -> None:
         calibrate(side, distortion="none", skew=False) for side in in_parts(scene(), turned(scene(), 0.3), 9)
     )
     with pytest.raises(DegenerateGeometryError, match=r"after the rig moved .* or use --outliers"):
-        fit_stereo(left, right, outliers="keep")
+        fit_rig({"left": left, "right": right}, outliers="keep")
 
 
 def test_two_equal_parts_are_named_and_the_cameras_are_right() -> None:

@@ -12,6 +12,7 @@ from support.slow_cases import slow_but
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo, fit_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.triangulation import METHODS, triangulate
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Pose
@@ -227,7 +228,7 @@ def test_a_board_turned_in_one_image_is_named_and_left_out() -> None:
     with pytest.raises(
         DegenerateGeometryError, match=r"left03/right03: the target is turned.*--outliers reject"
     ):
-        fit_stereo(*cameras, outliers="keep")
+        fit_rig(dict(zip(("left", "right"), cameras, strict=True)), outliers="keep")
     found = evaluate_stereo(*cameras)
     assert any("left03/right03" in text for text in found.warnings)
     assert found.rig is not None
