@@ -36,13 +36,14 @@ def conditions_on_views(views: Views, state: CameraState) -> NDArray[np.intp]:
 
 
 def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) -> Array:
-    """(V,) squared reprojection error of each view with a camera of its own and the common distortion.
+    """(V,) squared reprojection error of each view with a camera of its own and the distortion of the state.
 
     Its eleven parameters are as free as the network's product W V. No camera common to all views can have a
     smaller error, so this measures the precision of the points themselves.
     """
-    own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.model, state.k)
-    free = np.concatenate([np.ones(5, dtype=bool), np.zeros(len(state.k), dtype=bool)])
+    entries = np.tile(state.entries, (views.n_views // len(state.entries), 1))
+    own = CameraState(entries, state.R, state.t, state.model, state.k)
+    free = np.concatenate([np.ones(5, dtype=bool), np.zeros(state.k.shape[-1], dtype=bool)])
     return least_of_free_networks(adjust(views.batches, own, free, True, steps).normal)
 
 

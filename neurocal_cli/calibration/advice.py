@@ -35,6 +35,7 @@ _ROLLS = (0.0, 90.0)  # degrees
 _FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # distances of judged points, relative to that of the views
 _FLAT = 1e-6  # greatest ratio of thickness to size of a flat target
 _LEAST_SIGMA = 1e-4  # px; least noise, for perfect fits
+_MOST_VIEWS = 1000  # each takes time
 _SINGULAR = 1e-13  # eigenvalue of a matrix with unit diagonal, below which it is rounding
 
 
@@ -67,8 +68,10 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     Raises
     ------
     InputError
-        The calibration has no points, no image size or no free parameter, or no view shows the whole target.
+        The calibration has no points, no image size or no free parameter, no view shows the whole target, or
+        the number of views is not 1 to 1000.
     """
+    refuse_count(count)
     known, world = _Known.of(calibration), points_of_target(calibration)
     options = candidates(calibration)
     if not options:
@@ -86,6 +89,12 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
         after.append(values[best])
     assert known.camera.image_size is not None
     return Advice(tuple(chosen), before, tuple(after), known.camera.image_size)
+
+
+def refuse_count(count: int) -> None:
+    """Refuse a number of views that is not positive, or larger than anyone takes, with an InputError."""
+    if not 0 < count <= _MOST_VIEWS:
+        raise InputError(f"the number of views must be 1 to {_MOST_VIEWS}, found {count}")
 
 
 @frozen_dataclass(eq=False)

@@ -254,7 +254,7 @@ def evaluate(lens_file: str, points: str | None, plots: Plots, as_json: bool) ->
         return
     data = noted(read_lens_points, points)
     evaluation = evaluate_lens(learnt, data)
-    verdict = judge_lens(learnt, evaluation.rmse_px)
+    verdict = judge_lens(learnt, evaluation.rmse_px, evaluation.noise_px)
     show.evaluation_report(evaluation, learnt.controls, verdict).print(as_json)
     warn(*evaluation.warnings)
     write_plots(plots, show.draw_evaluation, evaluation, learnt.controls)

@@ -184,6 +184,8 @@ def test_arguments_of_another_kind_are_named_with_what_to_give() -> None:
         (lambda: neurocal.Distortion([0.1]), "model must be a text, not list of float"),
         (lambda: neurocal.undistort_image("a.png", camera()), "image must be an array, not 'a.png'"),
         (lambda: neurocal.evaluate_camera(camera(), points.pixels), "points must be a Correspondences"),
+        (lambda: neurocal.advise(camera(), 10**30), "the number of views must be 1 to 1000"),
+        (lambda: neurocal.advise_rig(rig(), 0), "the number of views must be 1 to 1000, found 0"),
         (lambda: neurocal.advise(rig()), "calibration must be a Calibration, not StereoRig"),
         (lambda: neurocal.fit_stereo(points, points), "left must be a Calibration, not Correspondences"),
         (
@@ -192,7 +194,7 @@ def test_arguments_of_another_kind_are_named_with_what_to_give() -> None:
         ),
         (lambda: neurocal.rectify(camera()), "rig must be a StereoRig, not Calibration"),
         (lambda: neurocal.evaluate_stereo_rig(camera()), "rig must be a StereoRig"),
-        (lambda: neurocal.evaluate_rig(camera()), "rig must be a Rig, not Calibration"),
+        (lambda: neurocal.evaluate_rig(camera()), "rig must be a Rig or a StereoRig, not Calibration"),
         (
             lambda: neurocal.find_rig_drift(rig(), camera()),
             "new must be a Rig or a StereoRig, not Calibration; give what calibrate_rig made",

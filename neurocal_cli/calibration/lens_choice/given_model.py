@@ -65,20 +65,20 @@ def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
     poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
     if not poor and solution.alike < _CORRELATED:
         return solution
-    if not may_lead_lower(solution, LOWER, lambda few: total_cost(_lowest(few, more_starts))):
+    if not may_lead_lower(solution, LOWER, lambda few: [total_cost(_lowest(few, more_starts))]):
         return solution
     return replace(solution, adjusted=_lowest(solution, more_starts))
 
 
-def may_lead_lower(solution: Solution, share: float, lowest: Callable[[Solution], float]) -> bool:
+def may_lead_lower(solution: Solution, share: float, costs: Callable[[Solution], Iterable[float]]) -> bool:
     """Whether other starts may lead below a share of the squared error; of many views, a few are tried.
 
-    `lowest` is the squared error of the best of them.
+    `costs` are the squared errors that they lead to.
     """
     few = of_few_views(solution, _FEW_VIEWS)
     if few is solution or is_elsewhere(few, solution):
         return True
-    return lowest(few) < share * total_cost(few.adjusted)
+    return any(cost < share * total_cost(few.adjusted) for cost in costs(few))
 
 
 def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:

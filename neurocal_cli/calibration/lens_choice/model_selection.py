@@ -16,7 +16,7 @@ enough. If none does, the next simpler one is tried as long as it hardly lowers 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
@@ -130,12 +130,12 @@ def _may_lead_lower(
     """Whether another start leads below the limit; with many views, tested on a few of them."""
     closest = min(fitted.values(), key=lambda c: c.cost)
 
-    def lowest(few: Solution) -> float:
-        found = (fit_candidates(few.problem, start, by_views=False) for start in more_starts(few.problem))
-        return min((candidate.cost for each in found for candidate in each.values()), default=np.inf)
+    def costs(few: Solution) -> Iterator[float]:
+        for start in more_starts(few.problem):
+            yield from (c.cost for c in fit_candidates(few.problem, start, by_views=False).values())
 
     whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
-    return not np.isfinite(limit) or may_lead_lower(whole, limit / closest.cost, lowest)
+    return not np.isfinite(limit) or may_lead_lower(whole, limit / closest.cost, costs)
 
 
 def _limit(fitted: dict[str, Candidate]) -> float:

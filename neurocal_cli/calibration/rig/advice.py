@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target
+from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target, refuse_count
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig
 from neurocal_cli.calibration.rig.space_uncertainty import by_motion, fitted, pixel_moves, shared_covariance
@@ -52,8 +52,10 @@ def advise_rig(rig: Rig | StereoRig, count: int = 3) -> RigAdvice:
     Raises
     ------
     InputError
-        The rig has no points, a camera has no image size, or no view shows the target to two cameras.
+        The rig has no points, a camera has no image size, no view shows the target to two cameras, or the
+        number of views is not 1 to 1000.
     """
+    refuse_count(count)
     rig = any_rig(rig)
     if not rig.frames or not all(len(camera.points) for camera in rig.cameras.values()):
         raise InputError("the rig holds no points; give a file that was not written with --lean")

@@ -29,7 +29,7 @@ from neurocal_cli.calibration.rig.frames import (
 )
 from neurocal_cli.calibration.rig.given_points import Points, accepted, judged_by_points, other_size
 from neurocal_cli.calibration.rig.many_views import triangulate_many
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig, of_two
 from neurocal_cli.calibration.rig.space_error import SpaceError, space_error
 from neurocal_cli.calibration.rig.triangulation import Method, triangulate
 from neurocal_cli.calibration.target_choice import on_one_target
@@ -71,12 +71,12 @@ class StereoEvaluation(RigEvaluation):
     models: tuple[str, str]  # distortion models of the cameras
 
 
-def evaluate_rig(rig: Rig, points: Points | None = None) -> RigEvaluation:
+def evaluate_rig(rig: Rig | StereoRig, points: Points | None = None) -> RigEvaluation:
     """Evaluate a rig by points of its cameras.
 
     Parameters
     ----------
-    rig : Rig
+    rig : Rig or StereoRig
     points : dict of Correspondences by the name of the camera, optional
         By default those of the calibration, which gives smaller errors than new points. The poses of the
         frames of given points are fitted with fixed cameras.
@@ -87,7 +87,7 @@ def evaluate_rig(rig: Rig, points: Points | None = None) -> RigEvaluation:
         There are no points, a camera that the rig does not have, another image size or unit, or no frame of
         several cameras.
     """
-    given = points is not None
+    rig, given = any_rig(rig), points is not None
     fits, warnings = dict[str, Calibration](), list[str]()
     if points is not None:
         points, warnings = accepted(rig.cameras, with_poses(points)[0])

@@ -18,6 +18,8 @@ from itertools import product
 
 import numpy as np
 
+from neurocal_cli.adjustment.cross_validation import quietly
+from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.calibration.calibrate import calibrate
@@ -64,6 +66,7 @@ class LensEvaluation:
     n_points: int
     rmse_px: float  # over all points
     max_px: float
+    noise_px: float  # the same with a camera of its own for each view
     settings: tuple[SettingError, ...]  # in ascending order
     baselines: Mapping[str, float]  # rms of baseline models of the same data; nan where one gives no camera
     warnings: tuple[str, ...] = ()
@@ -101,6 +104,7 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
         n_points=len(squares),
         rmse_px=_rms(squares),
         max_px=float(np.sqrt(np.nanmax(squares))) if behind < len(squares) else np.nan,
+        noise_px=_noise(PixelData(points, lens.still, lens.model, lens.free_theta), local, constants),
         settings=tuple(_setting(points, s, squares[setting == s]) for s in range(points.n_settings)),
         baselines=baselines,
         warnings=tuple(warnings),
@@ -162,6 +166,13 @@ def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Consta
     state = PixelData(points, lens.still, lens.model, lens.free_theta).in_pixels(local, constants)
     seen, _ = predicted_pixels(state, points.points.world, points.points.view_index)
     return np.asarray(((seen - points.points.pixels) ** 2).sum(axis=1))
+
+
+@quietly
+def _noise(data: PixelData, local: Array, constants: Constants) -> float:
+    """Rms error of the points with a camera of its own for each view [px]; nan if a view has no pose."""
+    views = data.views
+    return views.pixel_scale * float(np.sqrt(2 * variance_of_views(views, data.state_of(local, constants))))
 
 
 def _rms(squares: Array) -> float:

@@ -41,8 +41,11 @@ _EXACT = 1e-9  # px
 _MORE_CAMERAS = "check the numbers of each camera, and add cameras where the parameters change most"
 
 
-def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
-    """Judge a lens, also by the rms reprojection error at other points [px] if there are any."""
+def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan"), noise_px: float = float("nan")) -> Verdict:
+    """Judge a lens, also by the rms reprojection error at other points and their noise [px], if any.
+
+    They may be less accurate than those of the calibration.
+    """
     everywhere = lens.predict(np.concatenate([lens.settings, middles(lens.settings)]))
     share = float((everywhere.std[:, :2] / everywhere.local[:, :2]).max())
     uncertain = (
@@ -55,9 +58,10 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
         findings = (*_of_known_cameras(lens, everywhere), uncertain, *_large_error(lens, elsewhere_px))
         return verdict_of(findings, measures)
     floor = lens.noise_floor_px
+    noise = float(np.fmax(floor, noise_px))
     elsewhere = (
-        ELSEWHERE.grade(elsewhere_px / max(floor, _EXACT)),
-        f"the error at the given points is {elsewhere_px:.3g} px, but the noise floor {floor:.3g} px",
+        ELSEWHERE.grade(elsewhere_px / max(noise, _EXACT)),
+        f"the error at the given points is {elsewhere_px:.3g} px, but the noise floor {noise:.3g} px",
         "check that target and camera are where they were, the unit of X,Y,Z and the names of the settings, "
         "or add settings where the parameters change most",
     )

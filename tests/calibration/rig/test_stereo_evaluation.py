@@ -11,7 +11,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo, fit_stereo
-from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo, evaluate_stereo_rig
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.triangulation import METHODS, triangulate
 from neurocal_cli.camera.geometry import Array, rotation_step
@@ -56,6 +56,22 @@ def test_points_are_those_that_the_rig_triangulates() -> None:
     assert found.epipolar_px == pytest.approx(np.sqrt((expected.epipolar**2).mean()), rel=1e-9)
     alike = triangulate(rig.left, rig.right, rig.pose, *(side.pixels for side in points))
     assert found.rmse_y < 0.8 * np.sqrt(((alike.points - expected.points + found.errors)[:, 1] ** 2).mean())
+
+
+def test_a_rig_of_two_is_a_rig() -> None:
+    points = dict(zip(("left", "right"), sides(flat()), strict=True))
+    rig = calibrate_stereo(*points.values(), skew=False, distortion="none", target="given")
+    own, found = evaluate_stereo_rig(rig).rig, evaluate_rig(rig).rig
+    assert own is not None
+    assert found is not None
+    assert found.rmse == pytest.approx(own.rmse, rel=1e-6)
+    assert [name for name, _ in rig.pairs] == list(found.views) == list(own.views)
+    given = evaluate_rig(rig, points)
+    assert given.rig is not None
+    assert given.rig.rmse == pytest.approx(own.rmse, rel=0.01)
+    assert given.verdict == evaluate_stereo_rig(rig, (points["left"], points["right"])).verdict
+    with pytest.raises(InputError, match=r"in cm, but the calibration in mm"):
+        evaluate_rig(rig, {name: replace(one, unit="cm") for name, one in points.items()})
 
 
 def test_the_errors_are_those_of_the_contract_written_out() -> None:

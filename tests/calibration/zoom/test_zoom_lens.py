@@ -62,6 +62,10 @@ def test_the_verdict_on_a_lens() -> None:
     good = judge_lens(smooth(), evaluate_lens(smooth(), seen("c", between(5, 3), seed=2)).rmse_px)
     assert good is not None
     assert (good.word, good.reasons) == ("good", ())
+    noisier = evaluate_lens(smooth(), seen("c", between(5, 3), seed=2, sigma=1.0))
+    assert judge_lens(smooth(), noisier.rmse_px, noisier.noise_px).word == "good"
+    changed = evaluate_lens(smooth(), seen("a", between(5, 3), seed=2, sigma=1.0))
+    assert judge_lens(smooth(), changed.rmse_px, changed.noise_px).word == "poor"
     far = judge_lens(smooth(), 2.0)
     assert far is not None
     assert far.word == "poor"
