@@ -71,6 +71,11 @@ def effective_number(n: float, rho: float, side: float = np.inf) -> float:
     return max(n / mean**2, 1.0)
 
 
+def independent_residuals(views: Views, state: CameraState, side: float = np.inf) -> float:
+    """How many residuals of a camera are independent, by the correlation of neighbours."""
+    return effective_number(views.n_equations, correlation(views, point_residuals(views, state)), side)
+
+
 def point_residuals(views: Views, state: CameraState) -> Array:
     """Residuals in normalised pixels in the order of the points; (N, 2)."""
     batches = views.batches

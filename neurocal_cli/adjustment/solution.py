@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
@@ -117,6 +118,11 @@ class Solution:
     def repeated(self) -> RepeatedPoses:
         """Which views repeat a pose."""
         return repeated_poses(self.problem.views, self.state, self.residuals)
+
+    @property
+    def minimum(self) -> Minimum:
+        """The linearised camera, of which it is known which views repeat a pose."""
+        return self.problem.minimum(self.adjusted, self.repeated)
 
     @cached_property
     def covariance(self) -> Covariance:

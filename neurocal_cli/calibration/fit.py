@@ -12,7 +12,7 @@ from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.residual_correlation import effective_number
 from neurocal_cli.adjustment.solution import Solution, restarted
 from neurocal_cli.calibration.lens_choice.given_model import (
     DENOMINATOR,
@@ -218,6 +218,5 @@ def shows_skew(solution: Solution) -> bool:
     cost, with_it = float(solution.adjusted.cost.sum()), float(skewed.adjust(solution.adjusted).cost.sum())
     if not 0 < with_it < cost:
         return False
-    alike = correlation(problem.views, point_residuals(problem.views, solution.state))
-    n = effective_number(max(problem.views.n_equations - skewed.n_parameters, 1.0), alike)
+    n = effective_number(max(problem.views.n_equations - skewed.n_parameters, 1.0), solution.alike)
     return log_odds(cost, with_it, n, 1) > LEVEL

@@ -21,8 +21,8 @@ from neurocal_cli.adjustment.free_networks import (
     least_of_free_networks,
 )
 from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import predicted_pixels
-from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
 from neurocal_cli.calibration.point_errors import places_of_views
@@ -41,12 +41,15 @@ _OWN_STEPS = 60
 
 
 def has_other_cause(
-    fits: Sequence[tuple[Problem, Adjusted]], found: Found, named_lens: bool, worth: float = 1.0
+    fits: Sequence[tuple[Problem, Adjusted]],
+    found: Found,
+    named_lens: bool,
+    repeated: RepeatedPoses | None = None,
 ) -> bool:
     """Whether the errors on the given target have another cause than the shape that was found.
 
-    It may be noise that neighbours share. Each camera is at its minimum for the given target. `worth` is the
-    effective share of the views if they repeat poses.
+    It may be noise that neighbours share. Each camera is at its minimum for the given target; of a single
+    one, it may be known which views repeat a pose.
     """
     # One or two views of planes that bend and were set up by hand show distortion as another target
     # (test_cli_stereo.py).
@@ -58,30 +61,22 @@ def has_other_cause(
     counted = min(counted_again(found, fits), 1.0)
     others = shared = 0.0
     for problem, adjusted in fits:
-        held = contest_of(problem, adjusted, worth)
+        m = problem.minimum(adjusted, repeated)
+        held = contest(m, problem.points.image_size)
         if held is not None:
             others += held.instead_of_target(counted)
-            noise = causes_among((NEIGHBOURS,), problem, adjusted.state, held.n)
+            noise = causes_among((NEIGHBOURS,), m, held.n)
             shared += max((one.evidence for one in noise), default=0.0)
     return max(others, shared) > gain_over_given(found, fits)
 
 
 def contradicts_sigma(solution: Solution) -> bool:
     """Whether the residuals contradict the stated standard deviations of the pixels."""
-    problem, points = solution.problem, solution.problem.points
+    points = solution.problem.points
     if points.covariance is None:
         return False
     predicted, _ = predicted_pixels(solution.in_pixels, points.world, places_of_views(solution, points))
-    alike = correlation(problem.views, point_residuals(problem.views, solution.state))
-    return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
-
-
-def contest_of(problem: Problem, adjusted: Adjusted, worth: float, shaped: bool = False) -> Contest | None:
-    """The contest at a fit, whose target's shape was estimated or not; `worth` is that of repeated poses."""
-    return contest(
-        problem.views, adjusted.state, problem.free_camera, problem.free_poses, problem.points.image_size,
-        worth=worth, shaped=shaped,
-    )  # fmt: skip
+    return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, solution.alike))
 
 
 def odd_view(solution: Solution) -> str | None:
@@ -98,7 +93,7 @@ def odd_view(solution: Solution) -> str | None:
     if views.n_views <= DETERMINE or problem.type == 3:
         return None
     if not problem.free_poses:
-        return _with_wrong_pose(contest_of(problem, adjusted, solution.repeated.worth))
+        return _with_wrong_pose(contest(solution.minimum, problem.points.image_size))
     conditions = conditions_on_views(views, adjusted.state)
     spare = views.equations - 6 - conditions
     if spare.min() <= 0:
@@ -120,10 +115,10 @@ def odd_view(solution: Solution) -> str | None:
     left = _contradictions(others.normal, free, own[rest]) / conditions[rest] / variance
     if not contradiction[view] > OUTLIER * max(float(median(left)), 1.0):
         return None
-    held = contest_of(problem, adjusted, solution.repeated.worth)
+    held = contest(solution.minimum, problem.points.image_size)
     if held is None or all(one.pattern == "all" for one in held.causes):
         return None
-    rivals = causes_among((ODD_VIEW, ANOTHER_LENS, *SHAPES), problem, adjusted.state, held.n)
+    rivals = causes_among((ODD_VIEW, ANOTHER_LENS, *SHAPES), solution.minimum, held.n)
     odds = next((one.evidence for one in rivals if one.rival is ODD_VIEW), 0.0) + LEVEL
     return None if any(one.evidence > odds for one in rivals) else views.names[view]
 

@@ -128,7 +128,7 @@ def _covariance_of(solution: Solution) -> CameraCovariance:
     at, posterior = solution.target_posterior or (None, None)
     return camera_covariance(
         CameraSeen(
-            solution.problem.minimum(solution.adjusted, solution.repeated),
+            solution.minimum,
             solution.problem.points,
             solution.target,
             posterior if at is solution.adjusted else None,  # or the camera has been adjusted again

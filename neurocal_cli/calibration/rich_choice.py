@@ -16,15 +16,14 @@ import numpy as np
 from neurocal_cli.adjustment.cross_validation import held_out_views
 from neurocal_cli.adjustment.problem import Problem, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.lens_choice.candidate_models import as_fisheye
 from neurocal_cli.calibration.lens_choice.model_selection import predicts_decidedly_better
 from neurocal_cli.calibration.lens_choice.monotonic_fit import normal_part
 from neurocal_cli.calibration.lens_choice.rich_fit import promised, with_displacement
-from neurocal_cli.calibration.other_causes import contest_of
 from neurocal_cli.calibration.outlier_rejection import fit_robustly
+from neurocal_cli.calibration.verdict.contest import contest
 from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
@@ -69,11 +68,10 @@ def with_rich_lens(
 
 def _rich_lens(solution: Solution) -> Solution | None:
     """Fit a rich lens on the given target; None if it, or already its prediction, is not good enough."""
-    problem, target, views = solution.problem, solution.target, solution.problem.views
-    if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
+    problem, target, size = solution.problem, solution.target, solution.problem.points.image_size
+    if problem.views.n_views < _FEWEST or solution.alike < _ALIKE or solution.repeated.n_poses < _FEWEST:
         return None
-    repeated = solution.repeated
-    held = contest_of(problem, solution.adjusted, repeated.worth) if repeated.n_poses >= _FEWEST else None
+    repeated, held = solution.repeated, contest(solution.minimum, size)
     # What differs from view to view may be the lens: other parts of it are seen.
     if held is None or (held.of_all_views and held.causes[0].rival.cause != RICHER_LENSES[0].cause):
         return None
@@ -90,12 +88,12 @@ def _rich_lens(solution: Solution) -> Solution | None:
     lost = _lost(rich, repeated)
     if not (np.isfinite(lost).all() and predicts_decidedly_better(lost, others, repeated, _BETTER)):
         return None
-    views, state = rich.problem.views, rich.state
-    if correlation(views, point_residuals(views, state)) > _NOISE:
+    if rich.alike > _NOISE:
         return None
-    odd = contest_of(rich.problem, rich.adjusted, rich.repeated.worth)
+    odd = contest(rich.minimum, size)
     if odd is not None and any(one.rival.cause in _BETWEEN for one in odd.causes):
         return None
+    views = rich.problem.views
     rms = float(np.sqrt(lost.sum() / len(views.index))) * views.pixel_scale
     return replace(rich, model_errors={**(solution.model_errors or {}), "rich": rms})
 

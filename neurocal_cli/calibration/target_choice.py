@@ -39,9 +39,10 @@ from neurocal_cli.adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_intrinsics
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
-from neurocal_cli.calibration.other_causes import contest_of, contradicts_sigma, has_other_cause
+from neurocal_cli.calibration.other_causes import contradicts_sigma, has_other_cause
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import MEDIAN, places_of_views, rms, squared_whitened
+from neurocal_cli.calibration.verdict.contest import contest
 from neurocal_cli.calibration.verdict.findings import DETERMINE
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
@@ -226,7 +227,7 @@ def _searched(
     found = common if choice == "flat" else _with_bends(solution, common)
     if found is not None and choice == "auto":
         fit, named = (solution.problem, solution.adjusted), solution.has_named_lens
-        if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated.worth):
+        if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated):
             return kept, rejected
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):
@@ -325,7 +326,8 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
     gain = gain_over_given(found, [given]) if common is None else found.evidence - common.evidence
-    held = contest_of(*before, solution.repeated.worth, common is not None)
+    m = before[0].minimum(before[1], solution.repeated)
+    held = contest(m, solution.problem.points.image_size, shaped=common is not None)
     return common if held is not None and held.instead_of_target() > gain else found
 
 

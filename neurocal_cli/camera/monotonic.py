@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.directions import project_directions
 from neurocal_cli.camera.distortion import (
-    POLYNOMIAL_MODELS,
     Distortion,
     coefficient_names,
     distort,
@@ -35,8 +34,6 @@ _HALVINGS = 40
 _SMALLEST = 1e-30  # smaller coefficients count as 0: their roots overflow or lie outside any image
 _REAL = 1e-6  # imaginary over real part of a double root that rounding can cause
 _SMALL_STEP = 0.02  # Newton step in the image plane after which the next one would be a thousandth
-# Radii at which a slope is sampled; between them it changes by far less than the margin.
-_RADII, _BEYOND, _MARGIN = 65, 2.0, 0.02
 
 _Three = tuple[Array, Array, Array]
 
@@ -121,26 +118,6 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
     by_bottom = -((u + up) * powers + u * growths) / v**2 + 2 * u * vp * powers / v**3
     none = np.zeros((len(r), 6))
     return slope, np.column_stack([by_top[:, :2], none[:, :2], by_top[:, 2:], by_bottom, none])[:, : len(k)]
-
-
-def reaches(distortion: Distortion, farthest: float) -> bool:
-    """Whether the model is certainly monotonic up to some distorted radius: a quick sufficient test.
-
-    With p = hypot(p1, p2), the tangential terms move a point of radius r by at most 3 p r^2, and their
-    derivatives are at most 6 p r. A disc on which the radial part grows faster, radially and tangentially, is
-    mapped without a fold and covers everything inside the image of its edge. False is inconclusive.
-    """
-    k = distortion.coefficients
-    if distortion.model not in POLYNOMIAL_MODELS[1:]:
-        return False  # these models have poles, or use another radius
-    r = np.linspace(0, _BEYOND * farthest, _RADII)
-    p = np.hypot(*k[2:4]) if len(k) > 2 else 0.0
-    radial = np.array([*k[:2], *k[4:]])
-    n = 2 * np.arange(1, len(radial) + 1)
-    powers = r[:, None] ** n
-    scale, slope = 1 + powers @ radial, 1 + powers @ ((n + 1) * radial)
-    disc = np.minimum.accumulate(np.minimum(slope, scale) - 6 * p * r) > _MARGIN
-    return bool((disc & (scale * r - 3 * p * r**2 > farthest)).any())
 
 
 def is_monotonic(distortion: Distortion, x: Array, y: Array) -> NDArray[np.bool_]:

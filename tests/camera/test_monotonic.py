@@ -10,7 +10,6 @@ from support.distorted import LENSES
 
 from neurocal_cli.camera.distortion import (
     Distortion,
-    coefficient_names,
     distort,
     distort_with_jacobian,
 )
@@ -19,7 +18,6 @@ from neurocal_cli.camera.monotonic import (
     is_monotonic,
     monotonic_radius,
     nearly_undistorted,
-    reaches,
     undistort,
 )
 
@@ -77,21 +75,6 @@ def test_the_fold_of_a_barrel_lens() -> None:
     assert monotonic_radius(Distortion("k1", [-0.3])) == pytest.approx(1 / np.sqrt(0.9), rel=1e-12)
     assert monotonic_radius(Distortion("k1", [0.3])) == np.inf
     assert monotonic_radius(Distortion()) == np.inf
-
-
-def test_what_a_quick_test_calls_monotonic_is() -> None:
-    """It looks forward only; the inverse has the last word."""
-    rng = np.random.default_rng(3)
-    yes = 0
-    for trial in range(600):
-        model = ("k1", "k1k2", "k1k2p1p2", "plumb_bob")[trial % 4]
-        size = np.array([0.4, 0.3, 0.01, 0.01, 0.3])[: len(coefficient_names(model))]
-        lens = Distortion(model, rng.normal(size=len(size)) * size * 10 ** rng.uniform(-0.5, 1))
-        farthest, angle = rng.uniform(0.1, 1.5), rng.uniform(0, 2 * np.pi, 40)
-        if reaches(lens, farthest):
-            yes += 1
-            assert np.isfinite(undistort(lens, farthest * np.cos(angle), farthest * np.sin(angle))[0]).all()
-    assert yes > 300
 
 
 def test_a_pole_of_the_rational_lens_is_a_fold() -> None:

@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.open_choices import radius
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.residual_correlation import independent_residuals, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back, normal_part
 from neurocal_cli.camera.directions import WIDE, WITH_XI
@@ -235,7 +235,7 @@ class _Chain:
         state = fisheye.adjusted.state
         if problem is None:
             return None
-        lacking = causes_among(RICHER_LENSES, fisheye.problem, state)
+        lacking = causes_among(RICHER_LENSES, fisheye.problem.minimum(fisheye.adjusted))
         if not any(one.evidence > LEVEL for one in lacking):
             return None
         starts = [first]
@@ -317,15 +317,13 @@ def falls_short(fitted: Iterable[Candidate]) -> bool:
 
     The reason must be another one than the shape of the target.
     """
-    from neurocal_cli.calibration.verdict.rival import causes_among
-    from neurocal_cli.calibration.verdict.rivals import SHAPES
+    from neurocal_cli.calibration.verdict.rivals import explained_by_shape
 
     best = min(fitted, key=lambda c: c.cost)
     least = _SHORT**2 * float(least_of_free_networks(best.adjusted.normal).sum()) + 1e-20
     if best.cost <= least:
         return False
-    shapes = causes_among(SHAPES, best.problem, best.adjusted.state)
-    return best.cost * (1.0 - max((one.explained for one in shapes), default=0.0)) > least
+    return best.cost * (1.0 - explained_by_shape(best.problem.minimum(best.adjusted))) > least
 
 
 def _is_decentred(omnidir: Candidate) -> bool:
@@ -347,7 +345,7 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
         return 1.0
     closest = min(fitted, key=lambda candidate: candidate.cost).adjusted.state
     side = float(np.sqrt(np.mean(views.counts)))
-    return effective_number(views.n_equations, correlation(views, point_residuals(views, closest)), side)
+    return independent_residuals(views, closest, side)
 
 
 def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:

@@ -29,7 +29,7 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.observability import is_weak
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.residual_correlation import independent_residuals
 from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back
 from neurocal_cli.calibration.verdict.findings import log_odds
@@ -109,9 +109,8 @@ def with_denominator_if_supported(solution: Solution) -> Solution:
         return solution
     richer = replace(problem, fixed=problem.fixed - DENOMINATOR)
     found = richer.adjust(solution.adjusted, _STEPS)
-    alike = correlation(views, point_residuals(views, found.state))
-    n = effective_number(views.n_equations, alike)
     before, after = (max(total_cost(a), 1e-300) for a in (solution.adjusted, found))
+    n = independent_residuals(views, found.state)
     told = log_odds(before, after, n, len(DENOMINATOR)) > 0.5 * DECISIVE
     better = told and folds_back(problem, found.state) is None
     if not better and folds_back(problem, solution.state) is None:
@@ -173,9 +172,8 @@ def undetermined_coefficients(problem: Problem, adjusted: Adjusted) -> str:
 
 def _that_suffices(problem: Problem, adjusted: Adjusted) -> str:
     """The simplest monotonic model that is better by the Bayesian information criterion; empty if none is."""
-    state, views = adjusted.state, problem.views
-    alike = correlation(views, point_residuals(views, state))
-    n, cost = effective_number(views.n_equations, alike), total_cost(adjusted)
+    state = adjusted.state
+    n, cost = independent_residuals(problem.views, state), total_cost(adjusted)
     entries = state.entries.copy()
     if state.model in WITH_XI:
         entries[:, :3] /= 1.0 + state.k[0]  # the scale in the middle of the image

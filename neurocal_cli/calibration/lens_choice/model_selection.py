@@ -39,6 +39,7 @@ from neurocal_cli.calibration.lens_choice.candidate_models import (
     worth,
 )
 from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, LOWER, Starts, may_lead_lower
+from neurocal_cli.calibration.lens_choice.monotonic_fit import TIE
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS
 from neurocal_cli.camera.geometry import Array
@@ -47,7 +48,6 @@ from neurocal_cli.observations.target import Target
 # Repeated by test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
 # 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
 # test_rendered_sets.py.
-_TIE = 0.009  # relative difference of rms errors that counts as equal
 # "Decidedly better" means by this number of standard errors over the five folds, and by this factor.
 _CERTAIN = 2.0
 _DECIDEDLY = 1.03
@@ -196,7 +196,7 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
     kept = {
         name: c
         for name, c in fitted.items()
-        if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
+        if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * TIE) * least)
     }
     # Ordinary lenses may be decentred as well.
     far = min(c.cost for c in ordinary) / _FAR_BETTER**2

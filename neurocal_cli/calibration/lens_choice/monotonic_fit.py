@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import Adjusted, Penalty
 from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.residual_correlation import independent_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, radial_part
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -32,7 +32,6 @@ from neurocal_cli.camera.monotonic import (
     largest_angle,
     monotonic_radius,
     radial_slope,
-    reaches,
     undistort,
     unproject_directions,
 )
@@ -91,7 +90,7 @@ def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondence
     there are tangential terms. Pixels outside the image circle of a lens that covers 90 degrees or more from
     its axis do not count.
     """
-    if distortion.model == "none" or _reaches_all(distortion, A, points):
+    if distortion.model == "none":
         return None
     # The farthest points suffice.
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
@@ -119,16 +118,6 @@ def told_of_fold(lens: str, is_mended: bool = True) -> str:
     )
 
 
-def _reaches_all(distortion: Distortion, A: Array, points: Correspondences) -> bool:
-    """Whether the distortion is certainly monotonic in the rectangle of the image and all points."""
-    low, high = points.pixels.min(axis=0), points.pixels.max(axis=0)
-    if points.image_size is not None:
-        low, high = np.minimum(low, 0), np.maximum(high, np.array(points.image_size) - 1)
-    corners = np.array([low[0], low[0], high[0], high[0]]), np.array([low[1], high[1], low[1], high[1]])
-    farthest = np.hypot(*normalised_points(A[ENTRIES].tolist(), *corners)).max()
-    return reaches(distortion, float(farthest))
-
-
 def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
     """Pixels along the image's border, or its corners; (N, 2)."""
     tangential = "p1" in coefficient_names(distortion.model)
@@ -153,11 +142,10 @@ def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted]
     Starts from the best fit, which is monotonic among the points. The resulting problem has the penalty; None
     if the data contradict every such distortion.
     """
-    views, cost = problem.views, float(found.cost.sum())
-    effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
+    cost = float(found.cost.sum())
     # The image circle of a wide lens may end within the image, and its corners show nothing.
     tie = 0.0 if found.state.distortion.wide else 2 * TIE
-    most = cost * (1 + max(tie, _CHANCE / effective))
+    most = cost * (1 + max(tie, _CHANCE / independent_residuals(problem.views, found.state)))
     for least_slope in _LEAST:
         result = _with_slope(problem, found, most, least_slope)
         if result is not None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, distinct_rows
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 from neurocal_cli.observations.measured_directions import unit
@@ -82,7 +82,9 @@ def find_lines(points: Correspondences) -> CollinearPoints:
     Each point is used on the four longest lines through it: the row, the column and the diagonals of a
     board. A point that was measured across an edge is used on lines along that edge.
     """
-    ids, target = _distinct(points.world)
+    first, ids = distinct_rows(points.world)
+    target = points.world[first] - points.world[first].mean(axis=0)
+    target /= np.ptp(target, axis=0).max() or 1.0
     fewest, most = FEWEST_ON_LINE, _LINES_A_POINT
     if points.across is not None:
         fewest, most = _FEWEST_OF_EDGES, _OF_EDGES
@@ -119,16 +121,6 @@ def _along_edges(lines: CollinearPoints, pixels: Array, across: Array) -> Collin
     n = unit(across)[row]
     slant = np.abs((n * unit(pixels[row[after]] - pixels[row[before]])).sum(axis=1))
     return CollinearPoints(row, first).only(~np.logical_or.reduceat(slant > _ALONG, first))
-
-
-def _distinct(world: Array) -> tuple[Index, Array]:
-    """Number of the distinct point of each row, and these points, centred and scaled to a size of about 1."""
-    centre = world.mean(axis=0)
-    size = float(np.ptp(world, axis=0).max()) or 1.0
-    local = (world - centre) / size
-    ids = _clusters(local @ np.array([0.4142135623730951, 0.2360679774997898, 0.1231056256176606]), 1e-11)
-    _, first = np.unique(ids, return_index=True)
-    return ids, local[first]
 
 
 def _clusters(values: Array, gap: float) -> Index:

@@ -10,12 +10,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.prior import STRETCH
+from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number
-from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.effects import another_lens, common, field, no_pupil
 from neurocal_cli.calibration.verdict.findings import (
@@ -43,7 +42,6 @@ from neurocal_cli.calibration.verdict.rivals import (
 from neurocal_cli.calibration.verdict.words import NEAR
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.state import CameraState
 
 _MOST = 3  # causes at once, and rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
@@ -94,28 +92,18 @@ class Contest:
         return worth * told / _FAR_MORE if first.pattern == "all" else 0.0
 
 
-def contest(
-    views: Views,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    image_size: tuple[int, int] | None,
-    *,
-    worth: float = 1.0,
-    shaped: bool = False,
-) -> Contest | None:
+def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False) -> Contest | None:
     """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
 
-    The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
-    estimated. `worth` is the effective share of the views if they repeat poses. `shaped` tells whether the
-    target's common shape was estimated with the camera.
+    `shaped` tells whether the target's common shape was estimated with the camera.
     """
-    if views.n_equations <= int(free.sum()) + 6 * views.n_views:
+    if m.views.n_equations <= int(m.free.sum()) + 6 * m.views.n_views:
         return None
-    known = tuple(effect for effect in EFFECTS if not (free_poses and effect in OF_POSES))
+    known = tuple(effect for effect in EFFECTS if not (m.free_poses and effect in OF_POSES))
+    worth = 1.0 if m.repeated is None else m.repeated.worth
 
     def at_minimum(*more: Effect) -> Linearised:
-        lin = linearised(views, state, free, free_poses, (*known, *more), image_size)
+        lin = linearised(m, (*known, *more), image_size)
         return _with_shape(lin) if shaped else lin
 
     try:

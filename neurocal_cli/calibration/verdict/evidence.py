@@ -276,7 +276,8 @@ class Evidence:
         # Sigmas that are wrong give single points the weight that all this is computed with.
         if not self.causes or self.stated or self.mistake or self._is_exact():
             return None
-        kept = self._contest_at(self.views, self.state)
+        m = self.minimum
+        kept = self._contest_at(m)
         if self.calibration.rejected.points is None or self.calibration.target is not None:
             return kept
         points = with_rejected(self.calibration)
@@ -284,21 +285,18 @@ class Evidence:
         views = arrange(points)
         start = normalised(self.calibration.state(points.view_names), views)
         state = adjust(views.batches, start, self.free, self.free_poses, _STEPS).state
-        held = self._contest_at(views, state)
+        held = self._contest_at(replace(m, views=views, state=state))
         if held is None or not held.of_all_views:
             return kept
         remains = kept is not None and any(one.rival is held.causes[0].rival for one in kept.causes)
         return replace(held, of_outliers=True, remains=remains)
 
-    def _contest_at(
-        self, views: Views, state: CameraState, free: NDArray[np.bool_] | None = None
-    ) -> Contest | None:
+    def _contest_at(self, m: Minimum, free: NDArray[np.bool_] | None = None) -> Contest | None:
+        """The contest at a minimum with these parameters free, by default those of the calibration."""
         target = self.calibration.target
-        held = contest(
-            views, state, free_entries(self.calibration, NODES) if free is None else free, self.free_poses,
-            self.points.image_size, worth=self.repeated.worth,
-            shaped=target is not None and (free is not None or target.bends is None),
-        )  # fmt: skip
+        shaped = target is not None and (free is not None or target.bends is None)
+        free = free_entries(self.calibration, NODES) if free is None else free
+        held = contest(replace(m, free=free), self.points.image_size, shaped)
         if held is None:
             return None
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
@@ -326,7 +324,8 @@ class Evidence:
         views = self.views if target is None else self._arranged(points)
         state = normalised(replace(state, k=np.where(hides, 0.0, state.k)), views)
         free[5:] &= ~hides
-        held = self._contest_at(views, adjust(views.batches, state, free, True, NEARBY).state, free)
+        there = adjust(views.batches, state, free, True, NEARBY).state
+        held = self._contest_at(replace(self.minimum, views=views, state=there), free)
         if held is None or not any(one.rival.of_given for one in held.causes):
             return []
         left = (1.0 - held.explained) * held.lin.cost

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.cross_validation import RIDGE
+from neurocal_cli.adjustment.cross_validation import RIDGE, Minimum
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, camera_columns, derivatives
 from neurocal_cli.adjustment.views import Views
@@ -143,19 +143,10 @@ class Linearised:
 
 
 def linearised(
-    views: Views,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    effects: tuple[Effect, ...],
-    image_size: tuple[int, int] | None,
+    m: Minimum, effects: tuple[Effect, ...], image_size: tuple[int, int] | None = None
 ) -> Linearised:
-    """Linearise a camera at its minimum.
-
-    The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
-    estimated.
-    """
-    state = state.with_model(_RICHER.get(state.model, state.model))
+    """Add the columns of effects to a camera at its minimum."""
+    views, free, state = m.views, m.free, m.state.with_model(_RICHER.get(m.state.model, m.state.model))
     K, board = len(state.k), Board.of(views)
     middle = np.zeros(2)
     if image_size is not None:
@@ -166,7 +157,7 @@ def linearised(
         products.append(flat @ np.swapaxes(flat, 1, 2))
     N = views.batches.sum_by_view(np.concatenate(products))
     kept = np.concatenate([camera_columns(K), np.arange(11 + K, N.shape[1])])
-    if free_poses:
+    if m.free_poses:
         R, solved = eliminate(N, kept, POSE_COLUMNS, RIDGE)
     else:
         R, solved = N[:, kept[:, None], kept], np.zeros((len(N), 6, len(kept)))
@@ -175,10 +166,10 @@ def linearised(
     for effect, width in widths.items():
         columns[effect] = np.arange(at, at + width)
         at += width
-    spare = views.n_equations - int(free.sum()) - (6 * views.n_views if free_poses else 0)
+    spare = views.n_equations - int(free.sum()) - (6 * views.n_views if m.free_poses else 0)
     return Linearised(
         views, state, effects, middle, R, N[:, kept[:-1], kept[:-1]], solved, columns,
-        np.flatnonzero(free), np.flatnonzero(~free[:5]), max(spare, 1.0), board, free_poses,
+        np.flatnonzero(free), np.flatnonzero(~free[:5]), max(spare, 1.0), board, m.free_poses,
     )  # fmt: skip
 
 

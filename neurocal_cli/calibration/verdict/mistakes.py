@@ -29,8 +29,7 @@ from neurocal_cli.calibration.verdict.findings import (
     pixel_spread,
     said,
 )
-from neurocal_cli.calibration.verdict.rival import causes_among
-from neurocal_cli.calibration.verdict.rivals import SHAPES
+from neurocal_cli.calibration.verdict.rivals import explained_by_shape
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.camera.homographies import homographies, homography_at
@@ -231,8 +230,7 @@ def why_odd(
         known.append((zoomed, odds(zoomed, 2), how))
     how = f"it fits another camera or crop: the image centre ({b[3]:.0f}, {b[4]:.0f})"
     known.append((moved, odds(moved, 2), how))
-    shapes = causes_among(SHAPES, plain.problem, plain.state)
-    bent = own * float(np.sqrt(1.0 - max((one.explained for one in shapes), default=0.0)))
+    bent = own * float(np.sqrt(1.0 - explained_by_shape(plain.problem.minimum(plain.adjusted))))
     least = LEVEL + max(odds(bent, len(BENDS)), 0.0)
     likely = [(evidence, reason) for error, evidence, reason in known if error < limit and evidence > least]
     if likely:

@@ -131,7 +131,7 @@ def _fitted(points: Correspondences, axis: int, s: float, skew: bool = True) -> 
 
 def _refined(found: Solution, axes: tuple[int, int]) -> float:
     """By which factor the first axis is longer than the other one, as the residuals have it."""
-    stretched = causes_among(SHAPES[1:2], found.problem, found.state)
+    stretched = causes_among(SHAPES[1:2], found.problem.minimum(found.adjusted))
     board = Board.of(found.problem.views)
     if not stretched:
         return 1.0

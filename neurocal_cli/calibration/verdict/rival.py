@@ -15,14 +15,12 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from neurocal_cli.adjustment.cross_validation import least_by_precision, quietly
+from neurocal_cli.adjustment.cross_validation import Minimum, least_by_precision, quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
-from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.calibration.verdict.findings import Cause, Said, in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.state import CameraState
 
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
 _ROUNDING = 1e-9
@@ -162,12 +160,9 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
     return sorted(best.values(), key=lambda one: -one.evidence)
 
 
-def causes_among(
-    rivals: tuple[Rival, ...], problem: Problem, state: CameraState, n: float | None = None
-) -> list[Estimate]:
-    """Those among some rivals at the minimum of a problem, as `estimates` has them; none if that fails."""
-    effects = tuple(one.effect for one in rivals if one.effect is not None)
-    lin = linearised(problem.views, state, problem.free_camera, problem.free_poses, effects, None)
+def causes_among(rivals: tuple[Rival, ...], m: Minimum, n: float | None = None) -> list[Estimate]:
+    """Those among some rivals at a minimum, as `estimates` has them; none if that fails."""
+    lin = linearised(m, tuple(one.effect for one in rivals if one.effect is not None))
     try:
         return estimates(lin, lin.spare if n is None else n, rivals)
     except np.linalg.LinAlgError:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.calibration.verdict import effects, words
 from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, SHARE, Limit
-from neurocal_cli.calibration.verdict.rival import Rival
+from neurocal_cli.calibration.verdict.rival import Rival, causes_among
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 
 CHANGED = Limit(0.002, 0.05)
@@ -306,6 +307,13 @@ ODD_POSE = next(
 """One view with another pose than the given one."""
 SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is effects.common)
 """Those by which the target has another shape in all views."""
+
+
+def explained_by_shape(m: Minimum) -> float:
+    """Largest share of the squared error that another shape of the target explains."""
+    return max((one.explained for one in causes_among(SHAPES, m)), default=0.0)
+
+
 EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
 """All effects of the rivals."""
 OF_POSES = (effects.pose, effects.moved_camera, effects.moved_target)

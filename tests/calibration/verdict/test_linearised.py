@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.places import PROJECT
 from support.targets import board, photographed
 
 from neurocal_cli import Correspondences
 from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict import effects
@@ -40,7 +42,12 @@ def at(points: Correspondences, state: CameraState, free: int = 0) -> tuple[Line
     views = arrange(points)
     some = np.arange(5) < free
     there = adjust(views.batches, normalised(state, views), some, True, 20).state
-    return linearised(views, there, some, True, EFFECTS, SIZE), views, there
+    return linearised(minimum(views, there, some), EFFECTS, SIZE), views, there
+
+
+def minimum(views: Views, there: CameraState, free: NDArray[np.bool_]) -> Minimum:
+    """A camera that is linearised, by the points themselves."""
+    return Minimum(views, there, np.zeros(0), free, free_poses=True)
 
 
 def left(lin: Linearised, effect: Effect, amounts: Array) -> float:
@@ -205,7 +212,7 @@ def test_a_new_cause_is_a_rival_and_wins_where_it_is_the_cause() -> None:
     views = arrange(with_pixels(points, np.column_stack([3.0 * u * v, 0 * u]) + noise))
     free = np.ones(5, dtype=bool)
     there = adjust(views.batches, normalised(state, views), free, True, 20).state
-    lin = linearised(views, there, free, True, (*EFFECTS, keystone), SIZE)
+    lin = linearised(minimum(views, there, free), (*EFFECTS, keystone), SIZE)
     first, second = estimates(lin, lin.spare, (*RIVALS, new))[:2]
     assert first.rival is new
     assert first.evidence > second.evidence + LEVEL
@@ -231,7 +238,7 @@ def test_the_derivatives_of_many_points_are_never_held_all_at_once() -> None:
     there, free = normalised(state, views), np.ones(5, dtype=bool)
     tracemalloc.start()
     try:
-        lin = linearised(views, there, free, True, EFFECTS, SIZE)
+        lin = linearised(minimum(views, there, free), EFFECTS, SIZE)
         most = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
