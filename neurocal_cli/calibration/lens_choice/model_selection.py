@@ -187,7 +187,11 @@ def _best(
 
 
 def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate]:
-    """Exclude models of wide lenses if ordinary ones are nearly as good, even ones that are not sound."""
+    """Exclude models of wide lenses if ordinary ones are nearly as good, even ones that are not sound.
+
+    Where no ordinary lens determines the focal length, a wide one does so by its formula, not by the points:
+    parallel boards near and far look alike. So there it has to be far better.
+    """
     ordinary = [c for name, c in fitted.items() if name not in WIDE and c.coefficients <= _MOST_ORDINARY]
     ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
     if not ordinary:
@@ -198,8 +202,10 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
         for name, c in fitted.items()
         if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * TIE) * least)
     }
-    # Ordinary lenses may be decentred as well.
     far = min(c.cost for c in ordinary) / _FAR_BETTER**2
+    if not any(c.determined for c in ordinary):
+        kept = {name: c for name, c in kept.items() if name not in WIDE or c.cost < far}
+    # Ordinary lenses may be decentred as well.
     return {name: c for name, c in kept.items() if name != "omnidir" or "fisheye" in kept or c.cost < far}
 
 
