@@ -44,30 +44,27 @@ _HOLE = 0.5  # least step of the light at the edge of a hole, over that at the o
 _SURE = 4.0  # standard deviations of the noise
 _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second row is shifted
 
-# Greatest deviations from a grid of circles, lights in contrasts. In brackets those of 220 rendered grids of
-# circles of 9 px and more, blurred by up to half of their radius; the second number is for circles that are
-# described, which may be smaller, blurred by a hand as far as they are wide, or holes of rings.
-_OFF = 0.05, 0.1  # of the distance to the next mark: from where those around a mark predict it (0.014)
-_INKS = 0.04, 0.25  # rms, of the share of the paper's light from a smooth change (0.02; photographs 0.034)
-_SIZES = 0.05, 0.2  # rms, of the log of the radius from a smooth change (0.01)
-_MIXED = (
-    0.015,
-    0.1,
-)  # rms, of the light by the distance from that of a disc or a ring (0.012; photographs 0.027)
-_LONG = 0.04, 0.16  # amplitude of two periods of the light by the angle, where it is half-way (0.03)
-_CORNERED = 0.009, 0.024  # of three and more periods (0.007; squares of 8 px 0.015, hexagons of 10 px 0.03)
-_SIGNED = (
-    0.09,
-    0.09,
-)  # spread of the light within most marks beyond that around them (0.02, rings 0.08; keys 0.12)
-_LABELLED = 1 / 8  # of the marks, beside which there may be ink
-_RULED = 0.015, 0.08  # change of the light in the paper between the marks (0.006; gaps between dice 0.025)
+_LABELLED = 1 / 8  # of the marks, beside which there may be ink, or which are partly hidden
+
+# What grids of circles hardly depart by, lights in contrasts, and how far departures add up as squares, where
+# circles are looked for and where they are described, which may be blurred by a hand as far as they are
+# wide. Of 1225 views of 336 rendered grids, four are beyond the first; of 354 that are described, all but one
+# have 17 at most, and of 90 other lattices, one has 35 and the others 60 and more (test_circles.py).
+_OFF = 0.005  # of the distance to the next mark: from where those around a mark predict it
+_INKS = 0.013  # rms, of the share of the paper's light from a smooth change
+_SIZES = 0.01  # rms, of the log of the radius from a smooth change
+_MIXED = 0.007  # rms, of the light by the distance from that of a disc or a ring
+_LONG = 0.02  # amplitude of two periods of the light by the angle, where it is half-way
+_CORNERED = 0.005  # of three and more periods
+_SIGNED = 0.06  # spread of the light within most marks beyond that around them
+_RULED = 0.015  # change of the light in the paper between the marks
+_DEPARTURES = 8.0, 45.0
 
 
 def are_circles(light: Image, places: Array, centre: Array, area: Array, described: bool) -> bool:
     """Whether marks (N,) of an area [px^2] at places (N, 2) of a board are circles on blank paper.
 
-    They may deviate more from these if a board of circles is `described`.
+    They may depart more from these if a board of circles is `described`.
     """
     flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
     start, steps = predicted(places, places, centre, flattening, itself=False)
@@ -76,8 +73,6 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     apart = float(away[away > 0].min())
     radius = min(float(np.median(np.sqrt(area / np.pi) / side)), 0.5 * apart)
     off = float(np.median(np.hypot(*(centre - start).T) / side)) / apart
-    if not off <= _OFF[described]:
-        return False
     # The first angle of each quarter is farthest from the next marks.
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS + (0.25 * np.pi if apart < _STAGGERED else 0.0)
     shares = np.arange(_FIRST, _NEXT * apart / radius, _STEP)
@@ -95,9 +90,10 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
     def odd(values: Array) -> float:
-        """What marks differ by (rms) from a smooth change over the board."""
+        """What marks differ by (rms) from a smooth change; some of a described board may be hidden."""
         change = smooth @ np.linalg.lstsq(smooth, values, rcond=None)[0]
-        return float(np.sqrt(((values - change) ** 2).mean()))
+        seen = round((1 - described * _LABELLED) * len(values))
+        return float(np.sqrt(np.sort((values - change) ** 2)[:seen].mean()))
 
     # Ink reflects the same share of the paper's light everywhere, in the shade as well.
     mark, paper = np.maximum(ring[:, inner], 0.0), np.maximum(ring[:, outer], 0.0)
@@ -132,9 +128,9 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     cornered = max(corners) * min(1.0, blur / (_SHARP * radius))
     near = rings < 0.5 * apart
     mixed = _misfit(mean[near].mean(axis=1), shares[near])
-    found = inks, sizes, mixed, long, cornered, signed, _ruled(levels[:, clear], inside)
-    limits = _INKS, _SIZES, _MIXED, _LONG, _CORNERED, _SIGNED, _RULED
-    return all(one <= most[described] for one, most in zip(found, limits, strict=True))
+    found = np.array([off, inks, sizes, mixed, long, cornered, signed, _ruled(levels[:, clear], inside)])
+    usual = [_OFF, _INKS, _SIZES, _MIXED, _LONG, _CORNERED, _SIGNED, _RULED]
+    return bool(((found / usual) ** 2).sum() <= _DEPARTURES[described])
 
 
 def _misfit(light: Array, at: Array) -> float:

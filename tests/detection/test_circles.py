@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support import no_boards
 from support.marked import errors_of, marked_scene, plane_of, ringed, taken
 from support.occluders import Disc
 from support.picture_bound import edge_bound
@@ -118,6 +119,14 @@ def test_a_round_thing_beside_the_board_does_not_change_the_ids() -> None:
     assert len(placed.place) == plane.cols * plane.rows
 
 
+@pytest.mark.parametrize(
+    ("form", "kind", "seed"), [("circles:11x5:20", "discs", 303), ("circles:11x8:20", "pieces", 304)]
+)
+def test_marks_of_several_sizes_and_inks_are_no_circles(form: str, kind: str, seed: int) -> None:
+    with pytest.raises(NoBoardError, match="no circles of one colour on blank paper"):
+        detect_points(no_boards.picture(kind, seed), Board((plane_of(form),)))
+
+
 @pytest.mark.parametrize(("width", "height", "gap"), [(14, 13, 0), (14, 10, 2), (8, 13, 2)])
 def test_windows_are_no_circles(width: int, height: int, gap: int) -> None:
     image = np.full((300, 420), 190, np.uint8)
@@ -152,15 +161,17 @@ def test_rings_are_round(radius: int, width: int) -> None:
     np.testing.assert_allclose(found.pixels, [45, 35] + at * [52, 50], atol=0.05)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_outlines_around_rings_are_no_circles(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("radius", "width", "blur", "seed"), [(12, 5, 1.2, 0), (12, 5, 1.2, 2), (8, 9, 0.7, 1)]
+)
+def test_rings_are_found_by_their_outer_edges(radius: int, width: int, blur: float, seed: int) -> None:
     ink = np.zeros((320, 420), np.uint8)
     for row in range(6):
         for column in range(7):
-            cv2.circle(ink, (45 + 52 * column, 35 + 50 * row), 12, (255,), 5, cv2.LINE_AA)
+            cv2.circle(ink, (45 + 52 * column, 35 + 50 * row), radius, (255,), width, cv2.LINE_AA)
     light = (90 + 0.3 * np.arange(420)) * (1 - 0.75 * ink / 255)
     noise = 6 * np.random.default_rng(seed).normal(size=ink.shape)
-    found = seen_circles(np.clip(cv2.GaussianBlur(light, (0, 0), 1.2) + noise, 0, 255).astype(np.uint8))
+    found = seen_circles(np.clip(cv2.GaussianBlur(light, (0, 0), blur) + noise, 0, 255).astype(np.uint8))
     assert found is not None
     assert (str(found), found.full) == ("7 x 6 circles", True)
 

@@ -20,6 +20,7 @@ from support.pictures import (
     Rendered,
     Scene,
     Sensor,
+    Sides,
     Target,
     digitised,
     ground_truth,
@@ -97,7 +98,9 @@ def ringed(scene: Scene, hole: float, seed: int) -> Rendered:
     assert isinstance(plane, CirclePlane)
 
     def light(share: float) -> Array:
-        discs = replace(target, plane=replace(plane, diameter=share * plane.diameter))
+        # The paper stays the same.
+        margin = Sides.all(target.margin.x_low + 0.5 * (1 - share) * plane.diameter / plane.square)
+        discs = replace(target, plane=replace(plane, diameter=share * plane.diameter), margin=margin)
         return image_light(replace(scene, targets=(discs,)), 5)
 
     rings = light(1.0) - light(hole) + light(1e-3)

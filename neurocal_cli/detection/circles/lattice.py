@@ -173,9 +173,9 @@ def _joined(outlines: list[NDArray[Any]]) -> tuple[NDArray[np.intp], Array]:
 
 
 def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether ellipses (n,) are darker than what is around them, in the middle and along the outline.
+    """Whether ellipses (n,) are darker within their outlines than around them; a ring is light in its middle.
 
-    Windows find rings around light discs, and a light ring around a disc has an outline of its own.
+    Windows find the surroundings of discs, too, whose outer outlines are no edges.
     """
     if not outlines:
         return np.zeros(0, dtype=np.bool_)
@@ -191,9 +191,7 @@ def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) ->
         levels = levels[np.lexsort((levels, of))]
         return np.asarray(0.5 * (levels[first + (count - 1) // 2] + levels[first + count // 2]))
 
-    around = level(_OUTSIDE)
-    x, y = np.rint(centre).astype(int).T
-    return np.asarray((image[y, x] < around - _STEPS[0]) & (level(_INSIDE) < around))
+    return np.asarray(level(_INSIDE) < level(_OUTSIDE) - _STEPS[0])
 
 
 _ALIKE = 2.2  # greatest ratio of the areas of circles on the board

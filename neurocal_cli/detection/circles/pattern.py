@@ -28,8 +28,6 @@ _LEAST_SHARE = 0.7  # of a pattern
 _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
 _LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses no rows of smaller ones
-# px^2: blurred rectangles and letters of 6 px look the same. Such circles are found if they are described.
-_SMALLEST = 45.0
 # Images that show the same full pattern without what is around it, and their least share.
 _AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
@@ -83,9 +81,7 @@ def _seen_in(
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    if np.median(area) < _SMALLEST or not are_circles(
-        grey.astype(np.float32), places, centre, area, described=False
-    ):
+    if not are_circles(grey.astype(np.float32), places, centre, area, described=False):
         return None
     full = share == 1
     return replace(seen, whole=full and _ends_seen(places, centre, area, grey.shape), full=full)
