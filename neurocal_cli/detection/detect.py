@@ -24,7 +24,7 @@ from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 
-_FEWEST = 8  # points; fewer determine little more than the pose
+_FEWEST = 8  # points, or all that the board has; fewer determine little more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge
 _PREFIXES = ("h:", "v:", "")  # by kind: prefix of a point's id
 
@@ -144,7 +144,8 @@ def detect_points(
         )
     measured = tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
     count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
-    if count < _FEWEST:
+    every = [one.vertex_ids() if points == "vertices" else one.midpoint_ids() for one in board.planes]
+    if count < min(_FEWEST, sum(map(len, every))):
         if not rejected:
             raise NoBoardError(f"only {count} points of the board are seen; show more of it")
         share = f"{count} of {count + rejected} points"

@@ -156,6 +156,17 @@ def test_a_corner_of_the_board_is_enough() -> None:
         detect_points(np.ascontiguousarray(picture.image[:200, :280]), scene.board, "vertices")
 
 
+@pytest.mark.parametrize(
+    ("form", "count"), [("charuco:3x4:40:30:DICT_4X4_50", (7, 6)), ("charuco:3x3:40:30:DICT_4X4_50", (4, 4))]
+)
+def test_all_points_of_a_small_board_are_enough(form: str, count: tuple[int, int]) -> None:
+    picture = taken(marked_scene(plane_of(form), 2, square=50.0, tilt=20.0), 2, 4)
+    for points, n in zip(("midpoints", "vertices"), count, strict=True):
+        error, _ = errors_of(detect_points(picture.image, Board((plane_of(form),)), points), picture)
+        assert len(error) == n
+        assert np.abs(error).max() < 0.03
+
+
 def test_another_dictionary_is_named() -> None:
     scene = marked_scene(plane_of(CHARUCO), 1)
     wrong = Board((plane_of("charuco:6x5:40:30:DICT_6X6_250"),))
