@@ -134,7 +134,7 @@ def judged_again(
         reach = radius(candidate.problem.views, candidate.adjusted.state)
         found = _assessed(candidate.problem, candidate.adjusted, by_views, reach, repeated)
         if found is not None:
-            again[model] = found
+            again[model] = replace(found, not_monotonic=candidate.not_monotonic)
     return again
 
 
@@ -168,6 +168,8 @@ class _Chain:
         fisheyes = self._fisheyes(state)
         found = self._monotonic([*fitted.values(), *fisheyes])
         fitted, fisheyes = dict(zip(fitted, found, strict=False)), found[len(fitted) :]
+        if not fisheyes and self._all_fold(found):
+            fisheyes = self._monotonic(self._fisheyes(state, least=0.0))
         if fisheyes:
             fisheyes = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
             n = worth(self.problem.views, fisheyes)
@@ -208,11 +210,14 @@ class _Chain:
         if candidate is not None and candidate.cost < cost:
             fitted[simple] = candidate
 
-    def _fisheyes(self, state: CameraState) -> list[Candidate]:
-        """Fit fisheyes with one, two and four coefficients, each from the previous one."""
+    def _fisheyes(self, state: CameraState, least: float = _WIDE) -> list[Candidate]:
+        """Fit fisheyes with one, two and four coefficients, each from the previous one.
+
+        There are none if all points are nearer to the axis than the `least` radius.
+        """
         problem = supported(self.problem, "fisheye")
         # The initial pinhole may underestimate the angles of a fisheye's points.
-        if problem is None or max(self.reach, radius(problem.views, state)) < _WIDE:
+        if problem is None or max(self.reach, radius(problem.views, state)) < least:
             return []
         found = []
         for count, tail in _FISHEYES:
@@ -250,6 +255,11 @@ class _Chain:
             return None
         # Its image circle may end within the image.
         return replace(found, not_monotonic=None) if found.not_monotonic == "image" else found
+
+    def _all_fold(self, fitted: list[Candidate]) -> bool:
+        """Whether all models near the lowest error fold back, as polynomials do beyond an image circle."""
+        lowest = min((c.cost for c in fitted), default=0.0)
+        return all(c.not_monotonic is not None for c in fitted if c.cost <= _BEHIND * lowest)
 
     def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
         """Fit promising models again that are not monotonic in image corners without points."""

@@ -15,7 +15,7 @@ from neurocal_cli.errors import InputError
 
 @frozen_dataclass(eq=False)
 class PoseDrift:
-    """What changed in the pose of a camera relative to the first camera of its rig.
+    """What changed in the pose of a camera relative to another camera of its rig.
 
     The standard deviations are those of the differences, from both calibrations.
     """
@@ -39,8 +39,9 @@ class RigDrift:
     """What changed from an old calibration of a rig to a new one."""
 
     cameras: Mapping[str, Drift]
-    poses: Mapping[str, PoseDrift]  # of all cameras but the first, relative to it
+    poses: Mapping[str, PoseDrift]  # of all cameras but one, relative to it
     unit: str  # of lengths
+    reference: str  # the camera to which the poses are relative
 
     @property
     def limit(self) -> float:
@@ -54,7 +55,7 @@ class RigDrift:
 
     @property
     def moved(self) -> tuple[str, ...]:
-        """Names of the cameras that have moved relative to the first one."""
+        """Names of the cameras that have moved relative to the reference."""
         return tuple(name for name, one in self.poses.items() if one.share < self.limit)
 
     @property
@@ -65,6 +66,9 @@ class RigDrift:
 
 def find_rig_drift(old: Rig | StereoRig, new: Rig | StereoRig) -> RigDrift:
     """Compare a new calibration of a rig with an old one: each camera, and its pose relative to the first.
+
+    If most cameras have moved relative to the first, their poses are relative to the camera to which the
+    fewest have moved: where the first one alone was knocked, it is the one that moved.
 
     Raises
     ------
@@ -83,12 +87,22 @@ def find_rig_drift(old: Rig | StereoRig, new: Rig | StereoRig) -> RigDrift:
             cameras[name] = find_drift(camera, new.cameras[name])
         except InputError as error:
             raise InputError(f"camera {name}: {error}") from error
-    poses = {name: find_pose_drift(old, new, name) for name in old.cameras if name != old.first}
-    return RigDrift(cameras, poses, old.unit)
+
+    def seen_from(reference: str) -> RigDrift:
+        others = [name for name in old.cameras if name != reference]
+        poses = {name: find_pose_drift(old, new, name, reference) for name in others}
+        return RigDrift(cameras, poses, old.unit, reference)
+
+    found = seen_from(old.first)
+    if len(found.moved) <= len(found.poses) / 2:
+        return found
+    return min((seen_from(name) for name in old.cameras), key=lambda one: len(one.moved) or len(old.cameras))
 
 
-def find_pose_drift(old: Rig, new: Rig, name: str) -> PoseDrift:
+def find_pose_drift(old: Rig, new: Rig, name: str, reference: str | None = None) -> PoseDrift:
     """Compare the pose of a camera in a new calibration of a rig with that in an old one.
+
+    The pose is relative to another camera of the rig, by default the first.
 
     Seven numbers are compared with their standard deviations: three angles, three coordinates and the
     baseline. Student's distribution allows for the few views from which the standard deviations come. The
@@ -105,11 +119,11 @@ def find_pose_drift(old: Rig, new: Rig, name: str) -> PoseDrift:
             f"the poses are relative to {old.first} in {old.unit} and to {new.first} in {new.unit}; "
             "calibrate both rigs alike"
         )
-    (before, of_old), (after, of_new) = _pose(old, name), _pose(new, name)
-    difference = np.concatenate([rotation_vector(after[0] @ before[0].T), after[1] - before[1]])
-    baseline = float(np.linalg.norm(after[1]) - np.linalg.norm(before[1]))
-    std = np.sqrt(np.diag(of_old + of_new))
-    baseline_std = float(np.hypot(old.std[name]["baseline"], new.std[name]["baseline"]))
+    before, after = (rig.pair(reference or old.first, name) for rig in (old, new))
+    difference = np.concatenate([rotation_vector(after.R @ before.R.T), after.t - before.t])
+    baseline = after.baseline - before.baseline
+    std = np.sqrt(np.diag(_covariance(before) + _covariance(after)))
+    baseline_std = float(np.hypot(before.std["baseline"], after.std["baseline"]))
     values, stds = np.append(difference, baseline), np.append(std, baseline_std)
     if not np.isfinite(stds).all():
         raise InputError(f"the standard deviations of the pose of {name} are unknown; take more views of it")
@@ -119,10 +133,8 @@ def find_pose_drift(old: Rig, new: Rig, name: str) -> PoseDrift:
     return PoseDrift(difference[:3], std[:3], difference[3:], std[3:], baseline, baseline_std, share)
 
 
-def _pose(rig: Rig, name: str) -> tuple[tuple[Array, Array], Array]:
-    """R and t of a camera, and the (6, 6) covariance of a small turn of R and of t."""
-    at = 6 * (list(rig.poses).index(name) - 1)
-    pose, covariance = rig.poses[name], rig.covariance[at : at + 6, at : at + 6]
+def _covariance(pair: StereoRig) -> Array:
+    """The (6, 6) covariance of a small turn of R and of t."""
     J = np.eye(6)
-    J[:3, :3] = np.linalg.pinv(euler_jacobian(pose.R))  # the turn that changes the angles
-    return (pose.R, pose.t), J @ covariance @ J.T
+    J[:3, :3] = np.linalg.pinv(euler_jacobian(pair.R))  # the turn that changes the angles
+    return np.asarray(J @ pair.covariance @ J.T)

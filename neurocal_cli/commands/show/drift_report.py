@@ -78,7 +78,7 @@ def rig_drift_report(drift: RigDrift) -> Report:
         cells = [two_digits(float(np.linalg.norm(one))) for one in sizes]
         poses.append([name, *cells, with_std(pose.baseline, pose.baseline_std), _chance(pose.share)])
     told = [f"{name} has changed" for name in drift.changed]
-    told += [f"{name} has moved relative to {next(iter(drift.cameras))}" for name in drift.moved]
+    told += [f"{name} has moved relative to {drift.reference}" for name in drift.moved]
     lines = [
         f"{'different' if told else 'the same within chance'}{': ' if told else ''}{', '.join(told)}",
         f"  a chance below {100 * drift.limit:.2g} % is a change; so unchanged rigs are called different in "
@@ -98,7 +98,7 @@ def rig_drift_report(drift: RigDrift) -> Report:
         }
         for name, one in drift.poses.items()
     }
-    tree = {"different": drift.different, "limit": drift.limit, "cameras": of_cameras, "poses": of_poses}
+    tree = attributes(drift, "different limit reference") | {"cameras": of_cameras, "poses": of_poses}
     return Report(tree, [images, poses], lines)
 
 

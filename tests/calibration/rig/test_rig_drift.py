@@ -11,7 +11,7 @@ from support.rigs import RigScene, random_rig, sides
 from neurocal_cli import Pose
 from neurocal_cli.calibration.drift import SHARE
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
-from neurocal_cli.calibration.rig.rig import Rig, of_two
+from neurocal_cli.calibration.rig.rig import Rig, named_std, of_two
 from neurocal_cli.calibration.rig.rig_drift import find_pose_drift, find_rig_drift
 from neurocal_cli.errors import InputError
 
@@ -52,6 +52,26 @@ def test_what_changed_in_a_rig_is_named() -> None:
     left, right = new.cameras
     longer = replace(left, alpha_u=1.01 * left.alpha_u, alpha_v=1.01 * left.alpha_v)
     assert "left" in find_rig_drift(old, calibrated(replace(new, cameras=(longer, right)), 3)).changed
+
+
+def test_of_several_cameras_the_knocked_one_is_named_even_if_it_is_the_first() -> None:
+    pair = calibrated(random_rig(np.random.default_rng(3), "verging", 10), 1)
+    names, none = "abcd", dict.fromkeys(pair.std["right"], 0.0)
+    poses = {name: Pose(np.eye(3), np.array([100.0 * k, 0, 0])) for k, name in enumerate(names)}
+    covariance = np.diag(np.tile([1e-6] * 3 + [0.01] * 3, 3))
+    std = {name: none if name == "a" else named_std(covariance[:6, :6], poses[name].t) for name in names}
+    cameras = dict.fromkeys(names, pair.cameras["left"])
+    rig = replace(pair, cameras=cameras, poses=poses, std=std, covariance=covariance)
+    turn = Pose.from_euler(0.0, 0.05, 0.0, np.zeros(3)).R
+
+    def knocked(*some: str) -> Rig:
+        turned = {name: Pose(turn @ p.R, turn @ p.t) if name in some else p for name, p in poses.items()}
+        return replace(rig, poses={name: pose.relative_to(turned["a"]) for name, pose in turned.items()})
+
+    assert not find_rig_drift(rig, knocked()).different
+    for some, reference in ((("c",), "a"), (("a",), "b"), (("a", "b"), "c")):
+        found = find_rig_drift(rig, knocked(*some))
+        assert (found.moved, found.reference) == (some, reference)
 
 
 def test_rigs_that_cannot_be_compared_are_refused() -> None:
