@@ -22,10 +22,8 @@ from neurocal_cli.adjustment.free_networks import (
 )
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
-from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.findings import DETERMINE, EXPLAINED, LEVEL
 from neurocal_cli.calibration.verdict.noise import stated_noise
@@ -72,11 +70,8 @@ def has_other_cause(
 
 def contradicts_sigma(solution: Solution) -> bool:
     """Whether the residuals contradict the stated standard deviations of the pixels."""
-    points = solution.problem.points
-    if points.covariance is None:
-        return False
-    predicted, _ = predicted_pixels(solution.in_pixels, points.world, places_of_views(solution, points))
-    return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, solution.alike))
+    problem = solution.problem
+    return bool(stated_noise(problem.points, solution.in_pixels, problem.free_camera, problem.free_poses))
 
 
 def odd_view(solution: Solution) -> str | None:

@@ -42,6 +42,16 @@ def test_a_sigma_that_is_too_small_is_named_alone(share: float, seed: int) -> No
     assert not any(words in reason for reason in others for words in FALSE), told
 
 
+@pytest.mark.parametrize("n", slow_but({20}, (6, 20, 60)))
+@pytest.mark.parametrize("seed", slow_but({1}, range(3)))
+def test_a_sigma_is_judged_without_the_weight_that_it_gives(n: int, seed: int) -> None:
+    """The camera follows points of so small a sigma: with it their own residuals are small."""
+    points, rng = flat(seed + 1), np.random.default_rng(seed)
+    small = np.isin(np.arange(len(points)), rng.choice(len(points), n, replace=False))
+    told = reasons(with_sigma(points, np.where(small, 0.004, 0.2)))
+    assert any(f"{n} points have a stated sigma of 0.004 px, but their" in reason for reason in told), told
+
+
 @pytest.mark.parametrize("share", slow_but({0.03}, [0.01, 0.03, 0.1, 0.4]))
 @pytest.mark.parametrize("seed", slow_but({0}, range(5)))
 def test_a_sigma_that_is_true_is_not_named(share: float, seed: int) -> None:

@@ -172,7 +172,7 @@ class Evidence:
     @cached_property
     def stated(self) -> tuple[Finding, ...]:
         """Residuals that contradict the stated standard deviations of the pixels."""
-        return tuple(stated_noise(self.points, self._residuals(), self.correlation))
+        return tuple(stated_noise(self.points, self.given, self.free, self.free_poses))
 
     @property
     def noise(self) -> tuple[Finding, ...]:

@@ -7,11 +7,18 @@ pixels and for the world points.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.common_noise import common_share, measured
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.common_noise import common_share, measured, with_common_share
+from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
+from neurocal_cli.adjustment.problem import normalised
+from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.verdict.findings import (
     CORRELATED,
     EXACT,
@@ -22,6 +29,7 @@ from neurocal_cli.calibration.verdict.findings import (
     pixel_spread,
 )
 from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
@@ -32,14 +40,16 @@ _TAKEN_IN = 1e-2  # share of the error that is left
 _FEWEST = 6  # points with a sigma that is too small: so few reach the factor once in 500,000 sets
 # Between views or points whose sigma is too small and the others, and between the sigmas of such points.
 _FACTOR = 2.0
+_STATE = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
+_STEPS = 5  # to the minimum with equal weights
 
 
-def noise_shape(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
+def noise_shape(points: Correspondences, residuals: Array, alike: float) -> Iterator[Finding]:
     """Findings about a direction, or views, with much larger residuals (N, 2) [px] than the others.
 
     Neighbouring residuals that are correlated are no measurement noise.
     """
-    if points.covariance is not None or len(points) < FEW_POINTS or correlation > CORRELATED.good:
+    if points.covariance is not None or len(points) < FEW_POINTS or alike > CORRELATED.good:
         return
     u, v = np.sqrt((residuals**2).mean(axis=0))
     least = EXACT * pixel_spread(points)
@@ -65,21 +75,34 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
         )
 
 
-def stated_noise(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
-    """Findings about points or views whose sigma is too small, or unrelated to the residuals (N, 2) [px].
+@quietly
+def stated_noise(
+    points: Correspondences, state: CameraState, free: NDArray[np.bool_], free_poses: bool
+) -> list[Finding]:
+    """Findings about points or views whose sigma is too small, or unrelated to the residuals.
 
-    A few points with a small sigma have most of the weight, so all else that seems wrong may come from them.
+    A few points with a small sigma have most of the weight, so all else that seems wrong may come from them,
+    and their own residuals are small. So the camera (`state`, in pixels) is adjusted with equal weights.
     If neighbouring residuals are correlated, it is the target or the lens that makes them larger than sigma.
     Covariances measured by a detector are not judged here, because `reweighting` handles them.
     """
     covariance = points.covariance
-    if covariance is None or measured(covariance) or not (residuals**2).sum() > 0:
-        return
-    advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
+    if covariance is None or measured(covariance):
+        return []
+    views = arrange(replace(points, covariance=None))
+    found = adjust(views.batches, normalised(state, views), free, free_poses, _STEPS).state
+    errors = point_residuals(views, found)
+    if not (errors**2).sum() > 0:
+        return []
+    residuals = np.empty_like(errors)
+    residuals[slice(None) if views.order is None else views.order] = errors * views.pixel_scale
+    if correlation(views, errors) <= CORRELATED.good:
+        unknown = (free.sum() + 6 * views.n_views * free_poses) / views.n_equations
+        some = _too_small_at_some(points, covariance, residuals, min(float(unknown), 1.0))
+        if some:
+            return [(1, some, _STATE)]
     if common_share(covariance, residuals) < EXPLAINED:
-        if correlation <= CORRELATED.good:
-            yield from _too_small_at_some(np.sqrt(covariance[:, 0]), residuals, advice)
-        return
+        return []
     V = points.n_views
     counts = np.bincount(points.view_index, minlength=V)
     squared = (residuals**2).sum(axis=1) / (2 * covariance[:, 0])
@@ -90,28 +113,36 @@ def stated_noise(points: Correspondences, residuals: Array, correlation: float) 
     if V > 1 and small.any() and order[step + 1] > _FACTOR * order[step]:
         names = np.array(points.view_names)[small]
         factor = float(np.median(level[small])) / float(np.median(level[~small]))
-        yield 1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", advice
-    else:
-        yield 1, "the stated sigmas do not predict the residuals", advice
+        return [(1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", _STATE)]
+    return [(1, "the stated sigmas do not predict the residuals", _STATE)]
 
 
-def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[Finding]:
-    """Finding about the points of the smallest sigma (N,), if their residuals are not as small."""
+def _too_small_at_some(points: Correspondences, covariance: Array, residuals: Array, unknown: float) -> str:
+    """What is wrong with the points of the smallest sigma; "" if nothing is, or with the others as well.
+
+    Exact points have the noise of the others by the share of the unknowns, which these determine.
+    """
+    sigma = np.sqrt(covariance[:, 0])
     usual = median(sigma)
     few = sigma * _FACTOR < usual
-    n = int(few.sum())
-    if n < _FEWEST:
-        return
-    squared = (residuals**2).sum(axis=1) / sigma**2
-    ratio = float(squared[few].mean() / max(squared[~few].mean(), NOTHING))
-    if ratio > _FACTOR**2:
-        yield (
-            1,
-            f"{n} points have a stated sigma of {median(sigma[few]):.2g} px, but their residuals are "
-            f"{np.sqrt(ratio):.2g} times as large for their sigma as those of the others, with {usual:.2g} "
-            "px",
-            advice,
-        )
+    n, counts = int(few.sum()), np.bincount(points.view_index)
+    share = np.bincount(points.view_index, few) / counts
+    of_views = ((share == 0) | (share == 1)).all()
+    if n < _FEWEST or of_views or common_share(covariance[~few], residuals[~few]) >= EXPLAINED:
+        return ""
+    squared = (residuals**2).sum(axis=1)
+
+    def larger(variance: Array) -> float:
+        relative = squared / variance
+        return float(relative[few].mean() / max(relative[~few].mean(), NOTHING))
+
+    if not larger(with_common_share(covariance, unknown)[:, 0]) > _FACTOR**2:
+        return ""
+    return (
+        f"{n} points have a stated sigma of {median(sigma[few]):.2g} px, but their residuals are "
+        f"{np.sqrt(larger(sigma**2)):.2g} times as large for their sigma as those of the others, with "
+        f"{usual:.2g} px"
+    )
 
 
 def stated_survey(target: Target, rmse_px: float, given_px: float) -> Iterator[Finding]:
