@@ -20,14 +20,11 @@ from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import independent_residuals, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back, normal_part
-from neurocal_cli.camera.directions import WIDE, WITH_XI
+from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import (
-    NOT_RADIAL,
     POLYNOMIAL_MODELS,
     coefficient_names,
-    distort,
     pinhole_coefficients,
-    radial_part,
 )
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -39,8 +36,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 # test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
 # the tightest that give these results; penalties and significance tests are chi-squared levels, as noted.
 #
-# Numbers of free fisheye coefficients with the fixed ones: higher ones need points far from the axis.
-_FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
+# Fixed coefficients of fisheyes: higher ones need points far from the axis.
+_FISHEYES = ({"k2", "k3", "k4"}, {"k3", "k4"}, set[str]())
 # Numbers of coefficients that each model adds to the next simpler one.
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 # Nested models, from simple to rich.
@@ -110,8 +107,7 @@ def supported(problem: Problem, model: str) -> Problem | None:
 def as_fisheye(problem: Problem, state: CameraState) -> tuple[Problem, Adjusted]:
     """Fit a fisheye with all its coefficients, starting from a state of any model."""
     fisheye = problem.with_model("fisheye")
-    k = _coefficients(state, "fisheye", radius(problem.views, state))
-    return fisheye, fisheye.adjust(replace(state, model="fisheye", k=k), _STEPS)
+    return fisheye, fisheye.adjust(_started(fisheye, state), _STEPS)
 
 
 def fit_candidates(
@@ -188,8 +184,7 @@ class _Chain:
         if simpler is None or self.wanted == "rational" or rational.penalty is not None:
             return False
         free, state = rational.free_camera, simpler.adjusted.state
-        start = replace(state, model="rational", k=_coefficients(state, "rational", self.reach))
-        normal, _ = normal_blocks(rational.views.batches, start)
+        normal, _ = normal_blocks(rational.views.batches, _started(rational, state))
         q = reduced(normal, free, rational.free_poses)
         S, scale = unit_diagonal(q.S.sum(axis=0))
         g = scale * q.g.sum(axis=0)
@@ -220,8 +215,8 @@ class _Chain:
         if problem is None or max(self.reach, radius(problem.views, state)) < least:
             return []
         found = []
-        for count, tail in _FISHEYES:
-            candidate = self._fit(replace(problem, fixed=problem.fixed | tail), state, count)
+        for tail in _FISHEYES:
+            candidate = self._fit(replace(problem, fixed=problem.fixed | tail), state)
             if candidate is not None:
                 found.append(candidate)
                 state = candidate.adjusted.state
@@ -283,15 +278,11 @@ class _Chain:
         # The image circle of a wide lens may end within the image.
         return replace(candidate, not_monotonic=None) if candidate.problem.distortion.wide else candidate
 
-    def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
+    def _fit(self, problem: Problem, state: CameraState) -> Candidate | None:
         """Fit one model; None if it did not converge, or if a part of the data is indispensable."""
         model = problem.distortion.model
-        if state.model in WIDE and state.model not in (model, "fisheye"):
-            similar = similar_states(state, "fisheye", farthest_angle(self.problem.views, state))
-            state = similar[0] if similar else replace(state, model="none", k=np.zeros(0))
-        start = replace(state, model=model, k=_coefficients(state, model, self.reach, most))
         steps = _RATIONAL_STEPS if model == "rational" else _STEPS
-        adjusted = problem.adjust(start, steps)
+        adjusted = problem.adjust(_started(problem, state), steps)
         if not adjusted.converged and model != "none":
             return None
         return _assessed(problem, adjusted, self.by_views, self.reach)
@@ -385,24 +376,10 @@ def _terms(model: str, reach: float) -> Array:
     return np.asarray(reach ** powers[: len(coefficient_names(model))])
 
 
-def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:
-    """Coefficients of another model with nearly the same distortion; for a fisheye the first `most`."""
-    names = coefficient_names(model)
-    old = dict(zip(coefficient_names(state.model), state.k.tolist(), strict=True))
-    fisheye = model == "fisheye"
-    estimated = set(names[:most] if fisheye else names)
-    if fisheye == (state.model == "fisheye") and {name for name, k in old.items() if k} <= estimated:
-        return np.array([old.get(name, 0.0) for name in names])
-    # Least squares up to the farthest point: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted radius of the
-    # undistorted radius r, where q is r or a fisheye's angle.
-    r = np.linspace(0.05, 1, 60) * reach
-    distorted = distort(state.model, radial_part(state.model, state.k), r, np.zeros_like(r))[0]
-    q = np.arctan(r) if fisheye else r
-    of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
-    powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
-    if not np.isfinite(distorted).all():  # there is a pole
-        return pinhole_coefficients(model)
-    found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
-    new = {name: k for name, k in old.items() if name in NOT_RADIAL}
-    new.update(zip(of_radius, found, strict=True))
-    return np.array([new.get(name, 0.0) for name in names])
+def _started(problem: Problem, state: CameraState) -> CameraState:
+    """The state with the problem's model, and nearly the same image."""
+    model, held = problem.distortion.model, problem.fixed
+    if state.model == model:
+        return state
+    similar = similar_states(state, model, farthest_angle(problem.views, state), held=held)
+    return similar[0] if similar else replace(state, model=model, k=pinhole_coefficients(model))
