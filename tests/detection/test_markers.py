@@ -234,6 +234,17 @@ def test_too_many_markers_for_a_dictionary_are_refused() -> None:
         detect_points(np.zeros((100, 100), np.uint8), board)
 
 
+def test_the_few_edges_of_a_small_part_are_not_uneven_by_chance() -> None:
+    """Their chi2 is beyond three standard deviations in one part of a hundred, by its skew distribution."""
+    scene = marked_scene(
+        plane_of("charuco:8x8:25.4:19.05:DICT_4X4_50"), 29059, 70.0, (320, 240), 40.0, 0.9, 3.0, -0.1,
+        shift=(97.1, -113.6),
+    )  # fmt: skip
+    found = detect_points(taken(scene, 29059, 4).image, scene.board, "vertices")
+    assert len(found.ids) == 12
+    assert np.sqrt(found.covariance[:, [0, 2]]).mean() < 0.0045  # 0.006
+
+
 def test_no_markers_are_no_board() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (200, 300)).astype(np.uint8)
     with pytest.raises(NoBoardError, match="no two markers"):
@@ -253,7 +264,7 @@ def test_tags_are_measured_at_their_corners_and_edges(points: str, most: float) 
 
 
 def test_tags_half_in_a_soft_shadow_are_measured_where_the_light_does_not_change() -> None:
-    """Polynomials through a shadow have slopes beside its border; within 20 px, edges have gradients."""
+    """Polynomials through a shadow have slopes beside its border; there, the light of edges bends."""
     every = []
     for seed in (0, 1):
         scene = marked_scene(plane_of("aprilgrid:4x3:40:0.3"), seed, 44.0)
@@ -264,8 +275,8 @@ def test_tags_half_in_a_soft_shadow_are_measured_where_the_light_does_not_change
         found = detect_points(image, scene.board, "vertices")
         every.append(errors_of(found, Rendered(image, truth)))
     error, squared = (np.concatenate(part) for part in zip(*every, strict=True))
-    assert np.sqrt((error**2).mean()) < 0.013
-    assert squared.mean() < 1.3
+    assert np.sqrt((error**2).mean()) < 0.0115
+    assert squared.mean() < 1.25
 
 
 def test_a_marker_that_was_read_wrongly_is_left_out() -> None:

@@ -170,23 +170,31 @@ def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:
     return replace(shape, nonlinearity=shape.nonlinearity + change)
 
 
-def with_gradients(fit: BatchFit, along: tuple[Single, ...], of_blur: bool, place: Array | None) -> BatchFit:
-    """Continue fits by a step that also fits gradients of the light, and of the blur, along distances (E, N).
+def with_gradients(
+    fit: BatchFit, along: tuple[Single, Single], of_blur: bool, place: Array | None
+) -> BatchFit:
+    """Continue fits by a step that also fits gradients of the light, and of the blur, along two axes (E, N).
 
     Gradients that shading and blur of the board do not contain displace an edge, or a vertex, where opposite
     squares then differ. They are relative to light and blur, and have normal priors. The variance of a prior
-    is what the estimates scatter more than by their errors: all of them and, beside the border of a shadow,
-    those around each `place` (E, 2) [px], if it is given. In even light and focus this is nothing, and the
-    fits stay as they are.
+    is what the estimates scatter more than by their errors. In even light and focus this is nothing, and the
+    fits stay as they are. Where the light follows nearby levels, this is the scatter around each `place`
+    (E, 2) [px], and the light may bend: it has second powers of the coordinates, too.
     """
     data, rows, size = fit.pixels, fit.linear.rows, fit.values.shape[1]
     mean, contrast, sigma = fit.values[:, MEAN:].T.astype(np.float32)[:, :, None]
     light = (mean + contrast * fit.linear.x) * data.root
-    changed = [light, rows[:, 1 + size + BLUR] * sigma][: 1 + of_blur]
-    patterns = np.stack([what * d for what in changed for d in along], axis=1)
+    a, b = along
+    patterns = [light * a, light * b]
+    if of_blur:
+        wider = rows[:, 1 + size + BLUR] * sigma
+        patterns += [wider * a, wider * b]
+    if place is not None:
+        patterns += [light * a * a, light * a * b, light * b * b]
+    changes = np.stack(patterns, axis=1)
     # Products with the residual, with the derivatives by the values, and with each other.
-    both = (patterns @ rows.swapaxes(1, 2))[:, :, : size + 1].astype(float)
-    products = (patterns @ patterns.swapaxes(1, 2)).astype(float)
+    both = (changes @ rows.swapaxes(1, 2))[:, :, : size + 1].astype(float)
+    products = (changes @ changes.swapaxes(1, 2)).astype(float)
     right, cross = both[:, :, :1], both[:, :, 1:]
     back = fit.covariance @ cross.swapaxes(1, 2)
     # At the minimum, the values need no step of their own: what is left determines the gradients.
@@ -197,15 +205,12 @@ def with_gradients(fit: BatchFit, along: tuple[Single, ...], of_blur: bool, plac
     free = np.linalg.inv(left)
     variance, found = np.einsum("eii->ei", free), (free @ right)[:, :, 0]
     believed = np.zeros_like(variance)
-    for k in range(len(changed)):
-        kind = slice(k * len(along), (k + 1) * len(along))
-        spread = excess_variance(found[:, kind].ravel(), variance[:, kind].ravel())
-        if spread > _NOTABLE * upper_median(variance[:, kind]):
+    for kind in np.split(np.arange(len(patterns)), [2, 4][: of_blur + (place is not None)]):
+        own = variance[:, kind]
+        if place is not None:
+            believed[:, kind] = excess_nearby(place, found[:, kind], own)
+        elif (spread := excess_variance(found[:, kind].ravel(), own.ravel())) > _NOTABLE * upper_median(own):
             believed[:, kind] = spread
-    if place is not None:
-        kind = slice(0, len(along))
-        nearby = excess_nearby(place, found[:, kind], variance[:, kind])
-        believed[:, kind] = np.maximum(believed[:, kind], nearby)
     used = np.flatnonzero(believed.any(axis=0))
     if not len(used):
         return fit

@@ -136,7 +136,7 @@ def fit_grid(grid_image: GridImage, undo: bool = True) -> GridFit:
     dark, light, noise = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(found.map.frame, dark, light)
     if isinstance(found.map, WideMap):
-        shading = LocalShading.of(shading, dark, light)
+        shading = adapted_shading(shading, dark, light, wide=True)
     mapped, sigma, levels, profile = _by_moments(grid_image, found, shading)
     sharpening = find_sharpening(profile) if undo else None
     if sharpening is not None:
@@ -314,9 +314,7 @@ def _shading(first: GridFit) -> Shading:
     dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
     light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
     smooth = fit_shading(first.map.map.frame, dark, light)
-    if isinstance(first.map.map, WideMap):
-        return LocalShading.of(smooth, dark, light)
-    return adapted_shading(smooth, dark, light)
+    return adapted_shading(smooth, dark, light, isinstance(first.map.map, WideMap))
 
 
 def _fine_fit(
@@ -339,8 +337,9 @@ def _fine_fit(
         shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
         fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
-    if isinstance(shading, LocalShading) and shading.has_slopes and isinstance(fit.pixels, EdgePixels):
-        fit = with_gradients(fit, (fit.pixels.d,), False, lines.middle)
+    if isinstance(shading, LocalShading) and isinstance(fit.pixels, EdgePixels):
+        along = fit.pixels.d, fit.pixels.lever * (0.5 * lines.length).astype(np.float32)[:, None]
+        fit = with_gradients(fit, along, False, lines.middle)
     return fit, noise
 
 

@@ -162,6 +162,7 @@ def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) 
 _STEPS = 25  # greatest number
 _SHIFT_PRIOR = 1e-2  # 1/px^2; prior standard deviation of the shifts: 10 px
 _TINY = 1e-300
+_RARELY = 2.75  # standard deviations of the normal distribution
 _BELIEF = 20  # weight, in observations, of the prior that the given variances are true
 _CREEPING = 5e-3  # relative gain of chi2 below which the iteration ends
 _CONVERGED = 0.2  # the same for the gain in units of the squared scale
@@ -394,6 +395,9 @@ def _with_covariance(solution: _Solution, observations: Observations) -> MapFit:
     left = int(informative.sum()) - len(free) - len(shift)
     excess = float((z[informative] ** 2).sum()) / max(left, 0.2 * len(z))
     shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
+    # What chance exceeds once in 300 times, by Wilson and Hilferty: few degrees of freedom have a skew chi2.
+    third = 2 / (9 * max(left, 1))
+    by_chance = (1 - third + _RARELY * np.sqrt(third)) ** 3
     covariance = np.zeros((len(now.parameters),) * 2)
     covariance[free[:, None], free] = inverse[: len(free), : len(free)]
     return MapFit(
@@ -402,5 +406,5 @@ def _with_covariance(solution: _Solution, observations: Observations) -> MapFit:
         shift_covariance=inverse[len(free) :, len(free) :].copy(),
         residual=residual,
         weight=weight,
-        excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,
+        excess=excess if excess > by_chance else shrunk,
     )

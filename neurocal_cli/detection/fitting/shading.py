@@ -1,4 +1,8 @@
-"""Levels of the dark and the light squares over the image: low-degree polynomials, fitted robustly."""
+"""Levels of the dark and the light squares over the image: polynomials, or those of nearby levels.
+
+Polynomials of up to the second degree are sufficient in most images. Vignetting, a lamp or a shadow is
+followed by planes, or by even levels, through the nearest levels, if these predict others better.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +29,15 @@ _CHANCE = 2.0  # variances of a level for each term, up to which a degree explai
 _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN, to avoid division by 0
-_NEAREST = 3  # the distance of the n-th nearest level is the width of the weights
-_POWERS = [(n - k, k) for n in range(6) for k in range(n + 1)]  # of x and y, by growing degree
+_NEAREST = 2  # the distance of so many nearest levels, for each term, is the width of the weights
+_POWERS = [(n - k, k) for n in range(3) for k in range(n + 1)]  # of x and y, by growing degree
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
-# Coefficients of richer polynomials, of degree 3 to 5; the ratio of their scatter to that of the best simpler
-# one from which they are used; and the spread of the levels around that, relative to their variances, from
-# which they are tried. Chosen on rendered lamps and vignetting (test_uneven_light.py).
-_RICHER, _GAIN, _NOTABLE = (10, 15, 21), 0.5, 1.0
-_EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which degree 2 is sufficient
-# A shadow is looked for if so many levels differ so much from the polynomials, relative to the contrast. It
-# is found if nearby levels predict a level with an error that is smaller by a factor.
-_SHADOWED, _OFF, _CLEARLY = 0.03, 0.1, 0.9
+_EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which polynomials are sufficient
+_CLEARLY = 0.8  # ratio of errors below which a richer description of the light predicts levels better
+_FEWEST = 3  # levels that are more than this are followed
+_NEARBY = 2  # the same of fits whose gradients tell about those of others nearby
+_LEAST_SPREAD = 0.1  # least variance of single levels around others, in variances of a level
+_FAR = 1e-5  # weight of levels far away, which determines a plane where nearby ones do not
 
 
 @frozen_dataclass(eq=False)
@@ -76,11 +78,6 @@ class Shading:
         """(2, N) variance [DN^2] of single dark and light levels around those at places (N, 2)."""
         return np.broadcast_to(self.spread[:, None], (2, len(place)))
 
-    @property
-    def has_slopes(self) -> bool:
-        """Whether the light may change within a square."""
-        return len(self.dark) > _TERMS[-1]
-
     def slopes(self, place: Array) -> tuple[Array, Array]:
         """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
         du, dv = _polynomial_slopes(self.frame, place, len(self.dark))
@@ -101,68 +98,60 @@ class Shading:
 
 @frozen_dataclass(eq=False)
 class LocalShading(Shading):
-    """Levels that also follow nearby squares, for the strong vignetting of wide lenses and for shadows."""
+    """Levels that follow nearby levels, with or without slopes, where polynomials do not."""
 
-    # Two arrays (N, 2) [px]: places at which the dark and the light levels were measured
-    near: tuple[Array, Array]
-    above: tuple[Array, Array]  # two arrays (N,) [DN]: their differences from the polynomials
-    has_border: bool  # of a shadow; the levels at it are uncertain
+    near: tuple[Levels, Levels]  # the dark and the light levels
+    terms: int  # 3 for planes; 1 for even levels, as on both sides of the border of a shadow
 
-    @property
-    def has_slopes(self) -> bool:
-        """Whether the light may change within a square."""
-        return self.has_border
-
-    @classmethod
-    def of(cls, smooth: Shading, dark: Levels, light: Levels, has_border: bool = False) -> Shading:
-        """Add the levels to which polynomials were fitted; with few levels, return the polynomials."""
-        if min(len(dark.level), len(light.level)) <= _NEAREST:
-            return smooth
-        above = smooth.off_levels((dark, light))
-        spread = [
-            min(excess_variance(_unlike_others(x.place, rest), x.variance), before)
-            for x, rest, before in zip((dark, light), above, smooth.spread, strict=True)
-        ]
-        near = dark.place, light.place
-        return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, above, has_border)
+    def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
+        """Differences of the levels from what the others nearby predict [DN]."""
+        dark, light = (one.level - self._through(one, one.place, itself=False)[0] for one in both)
+        return dark, light
 
     def levels_at(self, place: Array) -> tuple[Array, Array]:
         """Dark and light level at places (N, 2)."""
-        dark, light = (
-            level + _nearness(near, place) @ above
-            for level, near, above in zip(super().levels_at(place), self.near, self.above, strict=True)
-        )
+        dark, light = (self._through(one, place)[0] for one in self.near)
         return dark, light
 
     def spread_at(self, place: Array) -> Array:
         """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
-        if not self.has_border:
-            return super().spread_at(place)
-        spread = []
-        for base, near, above in zip(self.spread, self.near, self.above, strict=True):
-            weight = _nearness(near, place)
-            spread.append(base + np.maximum(weight @ above**2 - (weight @ above) ** 2, 0.0))
-        return np.stack(spread)
+        return np.stack([self._through(one, place)[2] for one in self.near])
+
+    def slopes(self, place: Array) -> tuple[Array, Array]:
+        """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
+        dark, light = (self._through(one, place)[1] for one in self.near)
+        return 0.5 * (light + dark), 0.5 * (light - dark)
+
+    def _through(self, levels: Levels, place: Array, itself: bool = True) -> tuple[Array, Array, Array]:
+        """Level (N,), slopes (N, 2) [1/px] and variance (N,) of single levels at places (N, 2)."""
+        weight = _nearness(levels.place, place, _NEAREST * self.terms, itself) + _FAR
+        near = polynomial_terms(self.frame, levels.place, self.terms)
+        products = (near[:, :, None] * near[:, None]).reshape(len(near), -1)
+        normal = (weight @ products).reshape(len(place), self.terms, self.terms)
+        right = weight @ (near * levels.level[:, None])
+        found = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        level = (found * polynomial_terms(self.frame, place, self.terms)).sum(axis=1)
+        slopes = np.zeros((len(place), 2))
+        slopes[:, : self.terms - 1] = found[:, 1:] / self.frame.unit
+        rest = weight @ levels.level**2 - (right * found).sum(axis=1)
+        return level, slopes, np.maximum(rest, _LEAST_SPREAD * upper_median(levels.variance))
 
 
-def _nearness(near: Array, place: Array, itself: bool = True) -> Array:
+def _nearness(near: Array, place: Array, nearest: int, itself: bool = True) -> Array:
     """Weights (N, M) of places `near` (M, 2) at places (N, 2), normal in their distances, with the sum 1."""
     away = ((place[:, None] - near) ** 2).sum(axis=-1)
     if not itself:
         np.fill_diagonal(away, np.inf)
-    width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
+    nearest = min(nearest, len(near) - 1) - 1
+    width = np.partition(away, nearest, axis=1)[:, nearest]
     weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
     return np.asarray(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
 
 
 def excess_nearby(place: Array, residual: Array, variance: Array) -> Array:
-    """Variance (N, 1) of residuals (N, K) around places (N, 2) beyond their known variances (N, K)."""
-    return np.maximum(_nearness(place, place) @ (residual**2 - variance).mean(axis=1, keepdims=True), 0.0)
-
-
-def _unlike_others(place: Array, value: Array) -> Array:
-    """Differences of values (N,) at places (N, 2) from the mean of the others nearby."""
-    return np.asarray(value - _nearness(place, place, itself=False) @ value)
+    """Variance (N, 1) of residuals (N, K) around places (N, 2) beyond twice their known variances (N, K)."""
+    excess = (residual**2 - 2 * variance).mean(axis=1, keepdims=True)
+    return np.maximum(_nearness(place, place, _NEARBY) @ excess, 0.0)
 
 
 def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels, float]:
@@ -231,57 +220,28 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     return coefficients, spread + count / n * upper_median(levels.variance)
 
 
-def adapted_shading(smooth: Shading, dark: Levels, light: Levels, raised: bool = True) -> Shading:
-    """Raise the degree of polynomials as far as required, or follow nearby levels if these predict better.
+def adapted_shading(smooth: Shading, dark: Levels, light: Levels, wide: bool = False) -> Shading:
+    """Follow nearby levels instead of polynomials if they predict levels clearly better.
 
-    They do where the board is partly in a shadow, whose border polynomials cannot follow. The slopes of these
-    would be wrong on both sides of it, so nearby levels are followed from even ones. If not `raised`, the
-    degree stays, because rough levels scatter around any polynomial.
+    Before a `wide` lens, whose vignetting no polynomial describes, nearby levels are followed in any case.
+    Planes suit light that changes over the whole board. Beside the border of a shadow, the slopes of planes
+    are wrong on both sides, and even levels suit better.
     """
     both = dark, light
-    if min(len(levels.level) for levels in both) == 0:
+    if min(len(levels.level) for levels in both) <= _FEWEST:
         return smooth
     half = upper_median(smooth.at(light.place)[1])
-    off = np.abs(np.concatenate(smooth.off_levels(both)))
-    shadowed = np.mean(off > _OFF * 2 * half) >= _SHADOWED
-    if not shadowed and smooth.spread.max() < (_EVEN * half) ** 2:
+    if not wide and smooth.spread.max() < (_EVEN * half) ** 2:
         return smooth
-    richer = _richer(smooth, dark, light) if raised else smooth
-    usual = [np.array([upper_median(levels.level)]) for levels in both]
-    even = replace(smooth, dark=usual[0], light=usual[1])
-    local = LocalShading.of(even, dark, light, has_border=True) if shadowed else richer
-    if not isinstance(local, LocalShading):
-        return richer
-    by_local = [_unlike_others(near, above) for near, above in zip(local.near, local.above, strict=True)]
-    errors = [np.abs(np.concatenate(left)).mean() for left in (richer.off_levels(both), by_local)]
-    return local if errors[1] < _CLEARLY * errors[0] else richer
-
-
-def _richer(smooth: Shading, dark: Levels, light: Levels) -> Shading:
-    """Raise the degree of the polynomials where the levels scatter around them by more than their errors."""
-    results = []
-    for levels, coefficients, residual, spread in zip(
-        (dark, light),
-        (smooth.dark, smooth.light),
-        smooth.off_levels((dark, light)),
-        smooth.spread.tolist(),
-        strict=True,
-    ):
-        n, usual = len(levels.level), upper_median(levels.variance)
-        degrees = [m for m in _RICHER if 3 * m <= n]
-        if degrees and spread > _NOTABLE * usual:
-            terms = polynomial_terms(smooth.frame, levels.place, degrees[-1])
-            scatter = _scatter(residual, _TERMS[-1])
-            for used in degrees:
-                tried, rest, left = coefficients, residual, spread
-                for _ in range(_STEPS):
-                    tried, rest, left = _refit(terms[:, :used], levels, rest, left)
-                if _scatter(rest, used) < _GAIN * scatter:
-                    coefficients, residual, scatter = tried, rest, _scatter(rest, used)
-                    spread = left + used / n * usual
-        results.append((np.pad(coefficients, (0, _RICHER[-1] - len(coefficients))), spread))
-    (low, low_spread), (high, high_spread) = results
-    return Shading(smooth.frame, low, high, np.array([low_spread, high_spread]))
+    planes, even = (
+        LocalShading(smooth.frame, smooth.dark, smooth.light, smooth.spread, both, k) for k in (3, 1)
+    )
+    best, least = smooth, np.inf
+    for shading in (planes, even) if wide else (smooth, planes, even):
+        error = float(np.abs(np.concatenate(shading.off_levels(both))).mean())
+        if error < _CLEARLY * least:
+            best, least = shading, error
+    return best
 
 
 def _refit(terms: Array, levels: Levels, residual: Array, spread: float) -> tuple[Array, Array, float]:

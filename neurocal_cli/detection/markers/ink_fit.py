@@ -131,7 +131,7 @@ def _levels(at: SmoothMap, lines: Lines, mean: Array, contrast: Array) -> tuple[
     variance = np.ones(len(mean))
     dark, light = (Levels(lines.middle, mean + sign * contrast, variance) for sign in (-1, 1))
     smooth = fit_shading(at.frame, dark, light)
-    return mean, contrast, adapted_shading(smooth, dark, light, raised=False)
+    return mean, contrast, adapted_shading(smooth, dark, light)
 
 
 def _by_pixels(
