@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.resizing import Resizing
 from neurocal_cli.observations.points import Correspondences
 
 
-def resized(
-    result: Calibration | StereoRig | Rig, changes: Sequence[Resizing]
-) -> Calibration | StereoRig | Rig:
+def resized(result: Calibration | Rig, changes: Sequence[Resizing]) -> Calibration | Rig:
     """The calibration, or the rig, of new images; one change for each camera.
 
     Standard deviations and covariances are those of the new parameters. Errors in pixels are multiplied by
@@ -31,9 +29,6 @@ def resized(
         return replace(_resized(result, changes[0]), views=views, second_poses=second)
     mean = float(np.mean([change.mean for change in changes]))
     errors: dict[str, Any] = {name: mean * getattr(result, name) for name in ("rmse_px", "max_px")}
-    if isinstance(result, StereoRig):
-        left, right = map(_resized, (result.left, result.right), changes)
-        return replace(result.lean, left=left, right=right, judgement=None, **errors)
     cameras = map(_resized, result.cameras.values(), changes)
     by_name = dict(zip(result.cameras, cameras, strict=True))
     return replace(result.lean, cameras=by_name, judgement=None, **errors)

@@ -78,7 +78,7 @@ def _distance(ctx: click.Context, param: click.Parameter, text: str | None) -> D
     return float(found[1]), found[2]
 
 
-def _errors_at(distance: Distance | None, result: Calibration | StereoRig | Rig | None) -> PlaneErrors | None:
+def _errors_at(distance: Distance | None, result: Calibration | Rig | None) -> PlaneErrors | None:
     """The errors at a distance in any unit; None if there is no distance."""
     if distance is None or result is None:
         return None

@@ -19,7 +19,7 @@ from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back, wr
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
@@ -167,7 +167,7 @@ def calibration_or_camera(
     return camera_of(camera), points
 
 
-def warn_of_poor(what: str, result: Calibration | StereoRig | Rig, so: str = "") -> None:
+def warn_of_poor(what: str, result: Calibration | Rig, so: str = "") -> None:
     """Warn of a result whose verdict is poor, with the first reason and what follows from it."""
     verdict = result.verdict
     if verdict is not None and verdict.word == "poor":

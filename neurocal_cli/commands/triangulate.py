@@ -153,7 +153,7 @@ def triangulate(
     tally.tell(as_json)
 
 
-def _sigma_of(rig: Rig | StereoRig) -> float:
+def _sigma_of(rig: Rig) -> float:
     """The noise of a rig's own points, or what is usual if it does not state any."""
     if not math.isnan(rig.sigma):
         return rig.sigma

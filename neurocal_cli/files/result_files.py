@@ -18,7 +18,7 @@ from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig
 
 
 def write_calibration(cal: Calibration, path: str | Path) -> None:
@@ -29,7 +29,7 @@ def write_calibration(cal: Calibration, path: str | Path) -> None:
     write_result(cal, path)
 
 
-def write_rig(rig: StereoRig | Rig, path: str | Path, alpha: float | None = None) -> None:
+def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
     """Write a rig file, whole or not at all; ``-`` is stdout.
 
     The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `write_result`.
@@ -38,7 +38,7 @@ def write_rig(rig: StereoRig | Rig, path: str | Path, alpha: float | None = None
 
 
 def write_result(
-    result: Calibration | StereoRig | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
+    result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
 ) -> tuple[str, ...]:
     """Write a calibration or a rig, whole or not at all.
 

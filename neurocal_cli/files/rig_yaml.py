@@ -12,6 +12,7 @@ their data; those in ``cameras`` are then without points and poses.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -111,8 +112,8 @@ def read_stereo_rig(path: str | Path) -> StereoRig:
     return stereo_from_field(read_tree(path))
 
 
-def stereo_from_field(root: Field) -> StereoRig:
-    """Read a rig; see `read_stereo_rig`."""
+def stereo_from_field(root: Field, names: tuple[str, str] = ("left", "right")) -> StereoRig:
+    """Read a rig, whose cameras get these names; see `read_stereo_rig`."""
     if "stereo" not in root:
         if "neurocal" in root:
             root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
@@ -132,15 +133,15 @@ def stereo_from_field(root: Field) -> StereoRig:
         pose = Pose(found["R"], found["t"])
     stated = {**found["rotation"], **found["translation"]}
     delay = found["delay"] or {"timed": False}
-    rig = StereoRig(
-        left,
-        right,
-        pose,
-        {name: std for name, (_, std) in stated.items()} | {"baseline": found["baseline_std"]},
-        found["covariance"]["data"].array(6, 6, unknown=True),
-        delay=(delay["value"], delay["std"]) if "value" in delay else None,
+    std = {name: std for name, (_, std) in stated.items()} | {"baseline": found["baseline_std"]}
+    covariance, rest = found["covariance"]["data"].array(6, 6, unknown=True), _REST.read(block)
+    faults = rest.pop("left_out").items()
+    rig = replace(
+        StereoRig(*of_two(names, (left, right), pose, std, covariance, rest.pop("pairs"))),
+        views_left_out={view: why for pair, why in faults for view in zip(names, pair, strict=True)},
+        delays={names[1]: (delay["value"], delay["std"])} if "value" in delay else {},
         timed=delay["timed"],
-        **_REST.read(block),
+        **rest,
         **{key: found[key] for key in ("rmse_px", "max_px", "converged", "stop_reason", "iterations")},
     )
     _check_consistent(rig, block, found, [value for value, _ in stated.values()])
@@ -170,8 +171,8 @@ _POSES = named(
 )
 _EDGE = Keys("cameras: sentences, views: integer, baseline: number, baseline_std: measure")
 _RIG = Keys(
-    "unit: text, covariance: square, frames: rows of texts, left_out: reasons, delays?: delays,"
-    f"timed?: timed, {RESULT}, warnings: lines, verdict=judgement?: verdict",
+    "unit: text, covariance: square, frames: rows of texts, left_out=views_left_out: reasons,"
+    f"delays?: delays, timed?: timed, {RESULT}, warnings: lines, verdict=judgement?: verdict",
     {
         "delays": named("estimate", empty={}),
         "timed": inline(Field.boolean, boolean),
@@ -183,7 +184,7 @@ _RIG = Keys(
 )
 
 
-def format_rig(rig: Rig | StereoRig, alpha: float | None = None, by_rows: bool = False) -> str:
+def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
     """Text of a rig file; `alpha`, of two cameras, as in `rectify`, `by_rows` as in `format_calibration`."""
     if isinstance(rig, StereoRig):
         return format_stereo_rig(rig, alpha, by_rows)
@@ -204,8 +205,13 @@ def format_rig(rig: Rig | StereoRig, alpha: float | None = None, by_rows: bool =
     return "\n".join([*HEADER, *lines, ""])
 
 
+def _plain(rig: StereoRig) -> Rig:
+    """The same rig, of cameras that are known by their names."""
+    return Rig(**{one.name: getattr(rig, one.name) for one in fields(Rig)})
+
+
 def _pose(rig: Rig, name: str) -> dict[str, Any]:
-    return {"R": rig.poses[name].R, "t": rig.poses[name].t, "std": rig.std[name]}
+    return {"R": rig.poses[name].R, "t": rig.poses[name].t, "std": rig.pose_std[name]}
 
 
 def _edge(rig: Rig, first: str, second: str) -> dict[str, Any]:
@@ -228,13 +234,12 @@ def read_rig(path: str | Path) -> Rig:
 def rig_from_field(root: Field) -> Rig:
     """Read a rig; see `read_rig`."""
     if "rig" not in root or "cameras" not in root:
-        stereo = stereo_from_field(root)
-        return of_two(stereo)
+        return _plain(stereo_from_field(root))
     if "stereo" in root:
         names = list(root["cameras"].entries())
         if len(names) != 2:
             root["cameras"].fail("two cameras, as there are left and right")
-        return of_two(stereo_from_field(root), *names)
+        return _plain(stereo_from_field(root, (names[0], names[1])))
     own = root["rig"]
     check_format(own, RIG_FORMAT)
     cameras = {name: calibration_from_field(one) for name, one in root["cameras"].entries().items()}

@@ -216,6 +216,6 @@ def _errors(found: Rig, truth: SimulatedRig) -> tuple[float, float, float, float
         angles.append(np.linalg.norm(rotation_vector(pose.R @ true.R.T)))
         turned = (pose.euler - true.euler + np.pi) % (2 * np.pi) - np.pi
         error = np.concatenate([turned, pose.t - true.t])
-        ratios += [e / found.std[name][key] for e, key in zip(error, POSE_NAMES, strict=True)]
+        ratios += [e / found.pose_std[name][key] for e, key in zip(error, POSE_NAMES, strict=True)]
     centre, rotation, over_std = (float(np.sqrt(np.mean(np.square(x)))) for x in (places, angles, ratios))
     return found.rmse_px, centre, rotation, over_std

@@ -33,7 +33,9 @@ def test_a_rig_is_the_same_as_itself_also_from_a_pipe(rig: Path, tmp_path: Path)
 def test_a_camera_that_moved_is_named_and_the_exit_status_is_4(rig: Path, tmp_path: Path) -> None:
     former = read_stereo_rig(rig)
     moved = tmp_path / "moved.yaml"
-    moved.write_text(format_stereo_rig(replace(former, pose=Pose(former.R, 1.05 * former.t))))
+    moved.write_text(
+        format_stereo_rig(replace(former, poses={**former.poses, "right": Pose(former.R, 1.05 * former.t)}))
+    )
     found = run("drift", rig, moved, "--json")
     answer = json.loads(found.stdout)
     assert found.exit_code == 4

@@ -21,7 +21,8 @@ from neurocal_cli.files.result_files import write_result
 def rig() -> Rig:
     _, points = scene("line", 3, 10)
     found = calibrate_rig(points, skew=False, distortion="k1", target="given")
-    return replace(found, delays={"cam1": (0.1, 0.02), "cam2": (0.0, 0.01)}, left_out={("cam1", "x"): "why"})
+    delays = {"cam1": (0.1, 0.02), "cam2": (0.0, 0.01)}
+    return replace(found, delays=delays, views_left_out={("cam1", "x"): "why"})
 
 
 @pytest.mark.parametrize("name", ["rig.yaml", "rig.json"])
@@ -29,8 +30,8 @@ def test_a_rig_reads_back(rig: Rig, tmp_path: Path, name: str) -> None:
     write_rig(rig, tmp_path / name)
     back = read_rig(tmp_path / name)
     assert list(back.cameras) == list(rig.cameras)
-    assert (back.std, back.frames, back.left_out, back.delays) == (
-        rig.std, rig.frames, rig.left_out, rig.delays
+    assert (back.pose_std, back.frames, back.views_left_out, back.delays) == (
+        rig.pose_std, rig.frames, rig.views_left_out, rig.delays
     )  # fmt: skip
     for key, pose in rig.poses.items():
         assert (back.poses[key].t == pose.t).all()

@@ -77,7 +77,7 @@ def errors_over_std(rig: Rig, truth: SimulatedRig) -> Array:
         true, pose = truth.relative[name], rig.poses[name]
         turned = (pose.euler - true.euler + np.pi) % (2 * np.pi) - np.pi
         error = np.concatenate([turned, pose.t - true.t])
-        found += [e / rig.std[name][key] for e, key in zip(error, POSE, strict=True)]
+        found += [e / rig.pose_std[name][key] for e, key in zip(error, POSE, strict=True)]
     for name, camera in rig.cameras.items():
         K = truth.cameras[name].intrinsics
         found += [

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target, refuse_count
 from neurocal_cli.calibration.rig.adjust import RigFit
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_uncertainty import by_motion, fitted, pixel_moves, shared_covariance
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
@@ -46,7 +46,7 @@ class RigAdvice:
     share: float  # standard deviation of the weakest pair so far, over the distance of the boards
 
 
-def advise_rig(rig: Rig | StereoRig, count: int = 3) -> RigAdvice:
+def advise_rig(rig: Rig, count: int = 3) -> RigAdvice:
     """Choose views greedily, each for the pair of cameras that is the weakest then.
 
     Raises
@@ -56,7 +56,6 @@ def advise_rig(rig: Rig | StereoRig, count: int = 3) -> RigAdvice:
         number of views is not 1 to 1000.
     """
     refuse_count(count)
-    rig = any_rig(rig)
     if not rig.frames or not all(len(camera.points) for camera in rig.cameras.values()):
         raise InputError("the rig holds no points; give a file that was not written with --lean")
     if any(camera.image_size is None for camera in rig.cameras.values()):

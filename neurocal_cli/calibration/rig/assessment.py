@@ -237,8 +237,8 @@ def _left_out(rig: Rig) -> Iterator[Finding]:
         kind, n = "pairs of views", len(rig.frames) + len(rig.pairs_left_out)
         faults = {pair_name(pair): why for pair, why in rig.pairs_left_out.items()}
     else:
-        kind, n = "views", sum(map(len, rig.frames.values())) + len(rig.left_out)
-        faults = {f"{camera}/{view}": why for (camera, view), why in rig.left_out.items()}
+        kind, n = "views", sum(map(len, rig.frames.values())) + len(rig.views_left_out)
+        faults = {f"{camera}/{view}": why for (camera, view), why in rig.views_left_out.items()}
     changes: dict[str, list[str]] = {}
     for name, why in faults.items():
         if why.startswith(TAKEN):

@@ -29,7 +29,7 @@ from neurocal_cli.calibration.rig.frames import (
 )
 from neurocal_cli.calibration.rig.given_points import Points, accepted, judged_by_points, other_size
 from neurocal_cli.calibration.rig.many_views import triangulate_many
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig, of_two
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.rig.space_error import SpaceError, space_error
 from neurocal_cli.calibration.rig.triangulation import Method, triangulate
 from neurocal_cli.calibration.target_choice import on_one_target
@@ -71,12 +71,12 @@ class StereoEvaluation(RigEvaluation):
     models: tuple[str, str]  # distortion models of the cameras
 
 
-def evaluate_rig(rig: Rig | StereoRig, points: Points | None = None) -> RigEvaluation:
+def evaluate_rig(rig: Rig, points: Points | None = None) -> RigEvaluation:
     """Evaluate a rig by points of its cameras.
 
     Parameters
     ----------
-    rig : Rig or StereoRig
+    rig : Rig
     points : dict of Correspondences by the name of the camera, optional
         By default those of the calibration, which gives smaller errors than new points. The poses of the
         frames of given points are fitted with fixed cameras.
@@ -87,7 +87,7 @@ def evaluate_rig(rig: Rig | StereoRig, points: Points | None = None) -> RigEvalu
         There are no points, a camera that the rig does not have, another image size or unit, or no frame of
         several cameras.
     """
-    rig, given = any_rig(rig), points is not None
+    given = points is not None
     fits, warnings = dict[str, Calibration](), list[str]()
     if points is not None:
         points, warnings = accepted(rig.cameras, with_poses(points)[0])
@@ -285,7 +285,7 @@ class _Pairs:
             own = {name: view.pose for name, view in rig.left.views.items()}
             if self.fits:
                 one, other = (fit.points.view_names for fit in self.fits.values())
-                own |= poses_on_rig(of_two(rig).poses, self.fits, frames_of_pairs(one, other, self.new))
+                own |= poses_on_rig(rig.poses, self.fits, frames_of_pairs(one, other, self.new))
             used = [pair for pair in pairs if pair not in rig.left_out]
             if used:  # else all views contradict the rig
                 through = self._error([own[a] for a, _ in pairs], [rig.pose], used)
@@ -310,7 +310,7 @@ class _Pairs:
     def _judgement(self) -> Verdict | None:
         """The verdict on the rig by its own points."""
         if self.rig is not None:
-            return assess_rig(of_two(self.rig))
+            return assess_rig(self.rig)
         advice = ("calibrate both cameras together: neurocal stereo",)
         return Verdict("poor", (self.failure,), advice, {})
 
@@ -344,7 +344,7 @@ class _Pairs:
         frames = frames_of_pairs(left.view_names, right.view_names, self.views)
         otherwise = partial(other_size, rig, self._own_poses(self.new)[1])
         given = self.points, self.fits, frames, poses
-        return judged_by_points(self._judgement(), of_two(rig), *given, otherwise)
+        return judged_by_points(self._judgement(), rig, *given, otherwise)
 
     def _error(self, poses: list[Pose], rigs: list[Pose], used: Sequence[tuple[str, str]]) -> SpaceError:
         """Triangulate the points of the used views and compare them with the target."""

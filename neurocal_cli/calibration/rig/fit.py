@@ -98,7 +98,7 @@ def fit_rig(
         warnings.insert(0, told_left_out(left_out, problem, names))
     rig = replace(
         rig,
-        left_out={(names[c], view): why for (c, view), why in left_out.items()},
+        views_left_out={(names[c], view): why for (c, view), why in left_out.items()},
         judgement=assess_rig,
         warnings=tuple(warnings),
     )

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -54,7 +54,7 @@ class SpacePoints:
 
 
 def triangulate_many(
-    cameras: Rig | StereoRig | Mapping[str, Camera | Calibration],
+    cameras: Rig | Mapping[str, Camera | Calibration],
     point: ArrayLike,
     camera: Sequence[str] | NDArray[np.str_],
     pixels: ArrayLike,
@@ -66,7 +66,7 @@ def triangulate_many(
 
     Parameters
     ----------
-    cameras : Rig or StereoRig, or dict of Camera or Calibration by name
+    cameras : Rig, or dict of Camera or Calibration by name
     point : (M,) int array
         Number of the point of each row, from 0 to N - 1.
     camera : (M,) texts
@@ -87,8 +87,7 @@ def triangulate_many(
     if isinstance(cameras, Mapping):
         noise = np.ones(len(cameras))
     else:
-        rig = any_rig(cameras)
-        noise, poses, cameras = rig.noise_shares, rig.poses, rig.cameras
+        noise, poses, cameras = cameras.noise_shares, cameras.poses, cameras.cameras
     if poses is None or set(poses) != set(cameras):
         raise InputError("the poses are not those of the cameras; give the pose of each camera")
     names = list(cameras)

@@ -6,11 +6,11 @@ The poses are relative to the first camera: ``X_name = R X_first + t``, of two `
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,13 +24,56 @@ from neurocal_cli.camera.measured import PlaneErrors
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import InputError
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 _LEAST_NOISE = 0.1  # of a camera's pixels over that of all; fewer points may fit better by chance
 
 
 @frozen_dataclass(eq=False)
-class FixedCameras(Presented):
-    """Cameras that are fixed to each other: how well they fit, their verdict, what they measure in space."""
+class Rig(Presented):
+    """Calibrated cameras that are fixed to each other.
 
+    Attributes
+    ----------
+    cameras : dict of Calibration by name
+        A frame that several cameras saw has one pose: that in each camera follows from that in the first.
+    poses : dict of Pose by name
+        R and t, ``X_name = R X_first + t``; the first camera's is the identity.
+    pose_std : dict of dict by name
+        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline, the distance from the first
+        camera [world unit]; 0 for the first.
+    covariance : (6 (C - 1), 6 (C - 1)) array
+        Of the angles and translations of all cameras but the first.
+    frames : dict of dict by frame
+        The views that determine the rig: of each frame that several cameras saw, the view of each camera.
+    views_left_out : dict of str by (camera, view)
+        Views that contradict the rig, with the reason; each contributes to its own camera.
+    delays : dict of (value, std) by name
+        By how much the images of a camera were taken later than its stated times, or than those of the first
+        camera, in seconds if the rig is `timed`, else in units of the time between frames. Empty where it is
+        not estimated.
+    timed : bool
+        Whether the stated times of the images were used.
+    rmse_px : float [px]
+        ``sqrt(mean(du^2 + dv^2))`` over all points of all cameras.
+    max_px : float [px]
+    converged : bool
+    stop_reason : str
+    iterations : int
+        Iterations of the common bundle adjustment.
+    warnings : tuple of str
+    judgement : Verdict or callable, optional
+        The verdict read from a file, or the function that computes it from this rig; see `verdict`.
+    """
+
+    cameras: Mapping[str, Calibration]
+    poses: Mapping[str, Pose]
+    pose_std: Mapping[str, Mapping[str, float]]
+    covariance: Array
+    frames: Mapping[str, Mapping[str, str]]
+    views_left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     timed: bool = field(default=False, kw_only=True)
     rmse_px: float = field(default=float("nan"), kw_only=True)
     max_px: float = field(default=float("nan"), kw_only=True)
@@ -39,6 +82,14 @@ class FixedCameras(Presented):
     iterations: int = field(default=0, kw_only=True)
     warnings: tuple[str, ...] = field(default=(), kw_only=True)
     judgement: Verdict | Callable[[Any], Verdict | None] | None = field(default=None, kw_only=True)
+
+    _summary = ("commands.show.rig_report", "rig_report")
+
+    def __repr__(self) -> str:
+        return (
+            f"Rig of {len(self.cameras)} cameras ({', '.join(self.cameras)}): {len(self.frames)} "
+            f"frames, rms {self.rmse_px:.4g} px; see .cameras, .poses and .summary()"
+        )
 
     @property
     def sigma(self) -> float:
@@ -61,178 +112,14 @@ class FixedCameras(Presented):
         found: PlaneErrors = late("calibration.rig.space_uncertainty", "errors_at")(self, distance)
         return found
 
-
-@frozen_dataclass(eq=False)
-class StereoRig(FixedCameras):
-    """Two calibrated cameras on one rig.
-
-    Attributes
-    ----------
-    left, right : Calibration
-        A view of both cameras has one pose: that in the right camera is that in the left one, transformed by
-        the rig.
-    pose : Pose
-        R and t, ``X_right = R X_left + t``.
-    std : dict
-        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline [world unit].
-    covariance : (6, 6) array
-        Of R_x, R_y, R_z, t_x, t_y, t_z.
-    pairs : tuple of (left name, right name)
-        The views that determine the rig.
-    left_out : dict of str by (left name, right name)
-        Views that contradict the rig, with the reason; each contributes to its own camera.
-    delay : tuple of float, optional
-        By how much the right images were taken later than the left ones, and its std; see `Rig`.
-    timed : bool
-    rmse_px : float [px]
-        ``sqrt(mean(du^2 + dv^2))`` over all points of both cameras.
-    max_px : float [px]
-    converged : bool
-    stop_reason : str
-    iterations : int
-        Iterations of the common bundle adjustment.
-    warnings : tuple of str
-    judgement : Verdict or callable, optional
-        The verdict read from a file, or the function that computes it from this rig; see `verdict`.
-    """
-
-    left: Calibration
-    right: Calibration
-    pose: Pose
-    std: Mapping[str, float]
-    covariance: Array
-    pairs: tuple[tuple[str, str], ...]
-    left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
-    delay: tuple[float, float] | None = None
-
-    _summary = ("commands.show.rig_report", "stereo_report")
-
-    def __repr__(self) -> str:
-        std = self.std.get("baseline", float("nan"))
-        return (
-            f"StereoRig of {self.left.camera_name!r} and {self.right.camera_name!r}: {len(self.pairs)} pairs "
-            f"of views, rms {self.rmse_px:.4g} px\n"
-            f"  baseline {self.baseline:.6g} +- {std:.2g} {self.unit}; see .left, .right and .summary()"
-        )
-
     @property
-    def lean(self) -> StereoRig:
-        """Both cameras and their relative pose, without the data behind them."""
-        return replace(
-            self,
-            left=self.left.lean,
-            right=self.right.lean,
-            pairs=(),
-            left_out={},
-            judgement=self.verdict,
-        )
-
-    @property
-    def noise_shares(self) -> Array:
-        """(2,) standard deviation of each camera's pixels over that of both; 1 where it is not known."""
-        return of_two(self).noise_shares
-
-    @property
-    def R(self) -> Array:
-        """(3, 3) rotation from the left camera's frame to the right one's."""
-        return self.pose.R
-
-    @property
-    def t(self) -> Array:
-        """(3,) centre of the left camera in the right one's frame [world unit]."""
-        return self.pose.t
-
-    @property
-    def alone(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Views of the left camera alone and of the right camera alone."""
-        return unpaired(self.left.views, self.right.views, [*self.pairs, *self.left_out])
-
-    @property
-    def baseline(self) -> float:
-        """Distance of the cameras [world unit]."""
-        return float(np.linalg.norm(self.pose.t))
-
-    @property
-    def E(self) -> Array:
-        """(3, 3) essential matrix [t]x R: x_right^T E x_left = 0."""
-        return np.asarray(cross_matrix(self.t) @ self.R)
-
-    @property
-    def F(self) -> Array:
-        """(3, 3) fundamental matrix A_right^-T E A_left^-1 of unit norm: m_right^T F m_left = 0.
-
-        m are undistorted pixels.
-        """
-        F = np.linalg.solve(self.right.intrinsics.A.T, self.E) @ np.linalg.inv(self.left.intrinsics.A)
-        return np.asarray(F / np.linalg.norm(F))
-
-    @property
-    def unit(self) -> str:
-        """Unit of the world coordinates."""
-        return self.left.unit
-
-
-@frozen_dataclass(eq=False)
-class Rig(FixedCameras):
-    """Calibrated cameras that are fixed to each other.
-
-    Attributes
-    ----------
-    cameras : dict of Calibration by name
-        A frame that several cameras saw has one pose: that in each camera follows from that in the first.
-    poses : dict of Pose by name
-        R and t, ``X_name = R X_first + t``; the first camera's is the identity.
-    std : dict of dict by name
-        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline, the distance from the first
-        camera [world unit]; 0 for the first.
-    covariance : (6 (C - 1), 6 (C - 1)) array
-        Of the angles and translations of all cameras but the first.
-    frames : dict of dict by frame
-        The views that determine the rig: of each frame that several cameras saw, the view of each camera.
-    left_out : dict of str by (camera, view)
-        Views that contradict the rig, with the reason; each contributes to its own camera.
-    delays : dict of (value, std) by name
-        By how much the images of a camera were taken later than its stated times, or than those of the first
-        camera, in seconds if the rig is `timed`, else in units of the time between frames. Empty where it is
-        not estimated.
-    timed : bool
-        Whether the stated times of the images were used.
-    rmse_px : float [px]
-        ``sqrt(mean(du^2 + dv^2))`` over all points of all cameras.
-    max_px : float [px]
-    converged : bool
-    stop_reason : str
-    iterations : int
-        Iterations of the common bundle adjustment.
-    warnings : tuple of str
-    judgement : Verdict or callable, optional
-        The verdict read from a file, or the function that computes it from this rig; see `verdict`.
-    """
-
-    cameras: Mapping[str, Calibration]
-    poses: Mapping[str, Pose]
-    std: Mapping[str, Mapping[str, float]]
-    covariance: Array
-    frames: Mapping[str, Mapping[str, str]]
-    left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
-    delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-
-    _summary = ("commands.show.rig_report", "rig_report")
-
-    def __repr__(self) -> str:
-        return (
-            f"Rig of {len(self.cameras)} cameras ({', '.join(self.cameras)}): {len(self.frames)} "
-            f"frames, rms {self.rmse_px:.4g} px; see .cameras, .poses and .summary()"
-        )
-
-    @property
-    def lean(self) -> Rig:
+    def lean(self) -> Self:
         """The cameras and their poses, without the data behind them."""
         return replace(
             self,
             cameras={name: camera.lean for name, camera in self.cameras.items()},
             frames={},
-            left_out={},
+            views_left_out={},
             judgement=self.verdict,
         )
 
@@ -289,29 +176,28 @@ class Rig(FixedCameras):
             raise InputError(f"{left!r} is given twice; give two cameras")
         if left == self.first:
             at = 6 * (list(self.poses).index(right) - 1)
-            covariance, std = self.covariance[at : at + 6, at : at + 6], self.std[right]
+            covariance, std = self.covariance[at : at + 6, at : at + 6], self.pose_std[right]
             pose = self.poses[right]
         else:
             pose = self.poses[right].relative_to(self.poses[left])
             covariance = self._relative_covariance((left, right), pose)
             std = named_std(covariance, pose.t)
-        cameras = self.cameras[left], self.cameras[right]
-        pairs = tuple(
-            (views[left], views[right]) for views in self.frames.values() if {left, right} <= set(views)
-        )
+        names, cameras = (left, right), [self.cameras[left], self.cameras[right]]
+        both = [views for views in self.frames.values() if {left, right} <= set(views)]
         found = StereoRig(
-            *cameras, pose, std, covariance, pairs, converged=self.converged, stop_reason=self.stop_reason,
-            iterations=self.iterations, max_px=max(camera.max_px for camera in cameras),
+            *of_two(names, cameras, pose, std, covariance, [(views[left], views[right]) for views in both]),
+            converged=self.converged, stop_reason=self.stop_reason, iterations=self.iterations,
+            max_px=max(camera.max_px for camera in cameras),
         )  # fmt: skip
-        if (left, right) == tuple(self.cameras):
+        if names == tuple(self.cameras):
             return replace(
                 found,
-                left_out=self.pairs_left_out,
-                delay=self.delays.get(right),
+                views_left_out=self.views_left_out,
+                delays=self.delays,
                 timed=self.timed,
                 rmse_px=self.rmse_px,
                 warnings=self.warnings,
-                judgement=_judged_as(self),
+                judgement=self.judgement,
             )
         counts = [len(camera.points) for camera in cameras]
         squares = sum(n * float(c.rmse_px) ** 2 for n, c in zip(counts, cameras, strict=True) if n)
@@ -324,11 +210,11 @@ class Rig(FixedCameras):
     @property
     def pairs_left_out(self) -> dict[tuple[str, str], str]:
         """Of two cameras, the pairs of views that contradict the rig, with the reason."""
-        left, right = ([view for one, view in self.left_out if one == name] for name in self.cameras)
+        left, right = ([view for one, view in self.views_left_out if one == name] for name in self.cameras)
         if not (left and right):
             return {}
         first = self.first
-        return {(a, b): self.left_out[first, a] for a, b in pair_views(left, right)}
+        return {(a, b): self.views_left_out[first, a] for a, b in pair_views(left, right)}
 
     def _relative_covariance(self, names: tuple[str, str], pose: Pose) -> Array:
         """(6, 6) covariance of the angles and the translation from one camera to another."""
@@ -353,6 +239,118 @@ class Rig(FixedCameras):
         return np.asarray(J @ self.covariance @ J.T)
 
 
+@frozen_dataclass(eq=False)
+class StereoRig(Rig):
+    """A rig of two cameras, of which the first is the left one.
+
+    A view of both cameras has one pose: that in the right camera is that in the left one, transformed by the
+    rig.
+    """
+
+    _summary = ("commands.show.rig_report", "stereo_report")
+
+    def __repr__(self) -> str:
+        std = self.std.get("baseline", float("nan"))
+        return (
+            f"StereoRig of {self.left.camera_name!r} and {self.right.camera_name!r}: {len(self.pairs)} pairs "
+            f"of views, rms {self.rmse_px:.4g} px\n"
+            f"  baseline {self.baseline:.6g} +- {std:.2g} {self.unit}; see .left, .right and .summary()"
+        )
+
+    @property
+    def left(self) -> Calibration:
+        """The left camera."""
+        return self.cameras[self.first]
+
+    @property
+    def right(self) -> Calibration:
+        """The right camera."""
+        return self.cameras[self._second]
+
+    @property
+    def pose(self) -> Pose:
+        """R and t, ``X_right = R X_left + t``."""
+        return self.poses[self._second]
+
+    @property
+    def std(self) -> Mapping[str, float]:
+        """Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline [world unit]."""
+        return self.pose_std[self._second]
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Left and right names of the views that determine the rig."""
+        return tuple((views[self.first], views[self._second]) for views in self.frames.values())
+
+    @property
+    def left_out(self) -> dict[tuple[str, str], str]:
+        """Pairs of views that contradict the rig, with the reason; each contributes to its own camera."""
+        return self.pairs_left_out
+
+    @property
+    def delay(self) -> tuple[float, float] | None:
+        """By how much the right images were taken later than the left ones, and its std; see `Rig`."""
+        return self.delays.get(self._second)
+
+    @property
+    def R(self) -> Array:
+        """(3, 3) rotation from the left camera's frame to the right one's."""
+        return self.pose.R
+
+    @property
+    def t(self) -> Array:
+        """(3,) centre of the left camera in the right one's frame [world unit]."""
+        return self.pose.t
+
+    @property
+    def alone(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Views of the left camera alone and of the right camera alone."""
+        return unpaired(self.left.views, self.right.views, [*self.pairs, *self.left_out])
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the cameras [world unit]."""
+        return float(np.linalg.norm(self.pose.t))
+
+    @property
+    def E(self) -> Array:
+        """(3, 3) essential matrix [t]x R: x_right^T E x_left = 0."""
+        return np.asarray(cross_matrix(self.t) @ self.R)
+
+    @property
+    def F(self) -> Array:
+        """(3, 3) fundamental matrix A_right^-T E A_left^-1 of unit norm: m_right^T F m_left = 0.
+
+        m are undistorted pixels.
+        """
+        F = np.linalg.solve(self.right.intrinsics.A.T, self.E) @ np.linalg.inv(self.left.intrinsics.A)
+        return np.asarray(F / np.linalg.norm(F))
+
+    @property
+    def _second(self) -> str:
+        return list(self.cameras)[1]
+
+
+def of_two(
+    names: tuple[str, str],
+    cameras: Sequence[Calibration],
+    pose: Pose,
+    std: Mapping[str, float],
+    covariance: Array,
+    pairs: Iterable[tuple[str, str]],
+) -> tuple[Any, ...]:
+    """The first arguments of a rig of two cameras, left and right, with the views of both."""
+    left, right = names
+    exact = dict.fromkeys((*POSE_NAMES, "baseline"), 0.0)
+    return (
+        dict(zip(names, cameras, strict=True)),
+        {left: Pose(np.eye(3), np.zeros(3)), right: pose},
+        {left: exact, right: std},
+        covariance,
+        {a: {left: a, right: b} for a, b in pairs},
+    )
+
+
 def named_std(covariance: Array, t: Array) -> dict[str, float]:
     """Standard deviations of angles and translation by name, and of the baseline."""
     distance = float(np.linalg.norm(t))
@@ -360,42 +358,3 @@ def named_std(covariance: Array, t: Array) -> dict[str, float]:
     std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     named = dict(zip(POSE_NAMES, std.tolist(), strict=True))
     return named | {"baseline": float(np.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)))}
-
-
-def any_rig(rig: Rig | StereoRig) -> Rig:
-    """Any rig as one of named cameras."""
-    return of_two(rig) if isinstance(rig, StereoRig) else rig
-
-
-def _judged_as(rig: FixedCameras) -> Callable[[Any], Verdict | None] | None:
-    """The verdict of a rig in its other form, which can be pickled."""
-    return None if rig.judgement is None else partial(_verdict_of, rig)
-
-
-def _verdict_of(rig: FixedCameras, _: object) -> Verdict | None:
-    return rig.verdict
-
-
-def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:
-    """A stereo rig as a rig of two cameras with names."""
-    none = dict.fromkeys((*POSE_NAMES, "baseline"), 0.0)
-    left_out: dict[tuple[str, str], str] = {}
-    for (a, b), why in rig.left_out.items():
-        left_out |= {(left, a): why, (right, b): why}
-    return Rig(
-        {left: rig.left, right: rig.right},
-        {left: Pose(np.eye(3), np.zeros(3)), right: rig.pose},
-        {left: none, right: rig.std},
-        rig.covariance,
-        {a: {left: a, right: b} for a, b in rig.pairs},
-        left_out,
-        {} if rig.delay is None else {right: rig.delay},
-        timed=rig.timed,
-        rmse_px=rig.rmse_px,
-        max_px=rig.max_px,
-        converged=rig.converged,
-        stop_reason=rig.stop_reason,
-        iterations=rig.iterations,
-        warnings=rig.warnings,
-        judgement=_judged_as(rig),
-    )

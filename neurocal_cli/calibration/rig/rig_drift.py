@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from neurocal_cli.calibration.drift import FEW_VIEWS, SHARE, Drift, find_drift, tail
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_jacobian, rotation_vector
 from neurocal_cli.errors import InputError
@@ -64,7 +64,7 @@ class RigDrift:
         return bool(self.changed or self.moved)
 
 
-def find_rig_drift(old: Rig | StereoRig, new: Rig | StereoRig) -> RigDrift:
+def find_rig_drift(old: Rig, new: Rig) -> RigDrift:
     """Compare a new calibration of a rig with an old one: each camera, and its pose relative to the first.
 
     If most cameras have moved relative to the first, their poses are relative to the camera to which the
@@ -75,7 +75,6 @@ def find_rig_drift(old: Rig | StereoRig, new: Rig | StereoRig) -> RigDrift:
     InputError
         The rigs have other cameras, or a camera or a pose cannot be compared; the message names it.
     """
-    old, new = any_rig(old), any_rig(new)
     if set(old.cameras) != set(new.cameras):
         raise InputError(
             f"the rigs have different cameras: {', '.join(old.cameras)}, and {', '.join(new.cameras)}; "

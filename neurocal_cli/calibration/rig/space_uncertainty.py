@@ -18,7 +18,7 @@ from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significa
 from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given
 from neurocal_cli.calibration.rig.frames import pair_points
 from neurocal_cli.calibration.rig.motion import motion_of
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, any_rig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
@@ -154,9 +154,8 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     return depth, std
 
 
-def errors_at(rig: Rig | StereoRig, distance: float) -> PlaneErrors:
+def errors_at(rig: Rig, distance: float) -> PlaneErrors:
     """Errors of points that are triangulated at a distance from the first camera; see `Rig.errors_at`."""
-    rig = any_rig(rig)
     if not (np.isfinite(distance) and distance > 0):
         raise InputError(f"the distance must be a positive number, found {distance}")
     if not has_points(rig):

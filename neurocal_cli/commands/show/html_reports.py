@@ -41,7 +41,7 @@ _MOST_REJECTED = 200  # rows
 _SETTINGS = 25  # samples along a control
 
 
-Result = Calibration | StereoRig | Rig | ZoomLens
+Result = Calibration | Rig | ZoomLens
 Photographs = Sequence[Mapping[str, bytes]]  # of each camera: the images of its views as JPEG files
 
 
@@ -119,7 +119,7 @@ def _rig_page(rig: Rig, origin: Origin) -> str:
         f"The cameras and the boards of all frames, seen from above and from the right of {first}.",
     )
     left_out = [["view", "reason"]]
-    left_out += [[one_line(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
+    left_out += [[one_line(f"{a} / {b}"), reason] for (a, b), reason in rig.views_left_out.items()]
     parts = [
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(rig.verdict),

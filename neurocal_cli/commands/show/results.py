@@ -18,7 +18,7 @@ from neurocal_cli.commands.show.text import Table
 from neurocal_cli.commands.show.zoom_report import draw_lens, network_rows
 from neurocal_cli.errors import InputError, UsageError, check_choice
 
-Result = Calibration | StereoRig | Rig | ZoomLens
+Result = Calibration | Rig | ZoomLens
 
 
 class Picture(bytes):
@@ -93,10 +93,10 @@ def plot(result: Result, panel: str | None = None, kind: Literal["png", "svg", "
         return Picture(draw_lens(result, kind))
     from neurocal_cli.commands.show.plot_pages import draw_camera, draw_rig, draw_stereo
 
-    if isinstance(result, Rig):
-        return Picture(draw_rig(result, kind))
     if isinstance(result, StereoRig):
         return Picture(draw_stereo(result, kind, panel))
+    if isinstance(result, Rig):
+        return Picture(draw_rig(result, kind))
     if not len(result.points):
         raise InputError("the calibration holds no points; give one that was not written with --lean")
     from neurocal_cli.commands.show.camera_panels import Subject
@@ -104,7 +104,7 @@ def plot(result: Result, panel: str | None = None, kind: Literal["png", "svg", "
     return Picture(draw_camera(Subject.of(result), kind, panel))
 
 
-def notebook_html(result: Calibration | StereoRig | Rig | ZoomLens) -> str:
+def notebook_html(result: Calibration | Rig | ZoomLens) -> str:
     """The verdict and the parameters of a result."""
     if isinstance(result, Calibration):
         tables: tuple[Table, ...] = (parameter_rows(result),)

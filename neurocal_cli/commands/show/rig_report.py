@@ -73,7 +73,7 @@ def pose_rows(rig: Rig) -> tuple[Table, Table]:
     turns = [[heading, *(f"{name} [rad]" for name in POSE_NAMES[:3])]]
     shifts = [["", *(f"{name} [{length}]" for name in POSE_NAMES[3:]), f"distance [{length}]"]]
     for name, pose in list(rig.poses.items())[1:]:
-        std = rig.std[name]
+        std = rig.pose_std[name]
         cells = [with_std(value, std[key]) for key, value in pose.values.items()]
         distance = math.sqrt(float(pose.t @ pose.t))
         turns.append([one_line(name), *cells[:3]])
@@ -96,20 +96,20 @@ def _fit_lines(rig: Rig) -> list[str]:
     if rig.delays:
         told = ", ".join(f"{one_line(name)} {with_std(*delay)}" for name, delay in rig.delays.items())
         lines.append(f"images later than those of {one_line(rig.first)}: {told} {_time_unit(rig)}")
-    if rig.left_out:
-        lines.append(f"{plural(len(rig.left_out), 'view')} left out of the rig")
+    if rig.views_left_out:
+        lines.append(f"{plural(len(rig.views_left_out), 'view')} left out of the rig")
     lines += target_lines(rig.cameras[rig.first].target, rig.unit)
     return [*lines, rig.stop_reason]
 
 
-def _adjusted(rig: Rig | StereoRig) -> str:
+def _adjusted(rig: Rig) -> str:
     return (
         f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} px, after "
         f"{plural(rig.iterations, 'iteration')}"
     )
 
 
-def _time_unit(rig: Rig | StereoRig) -> str:
+def _time_unit(rig: Rig) -> str:
     return "s" if rig.timed else "of the time between frames"
 
 
@@ -118,11 +118,13 @@ def rig_json(rig: Rig) -> dict[str, Any]:
     return {
         "cameras": {name: calibration_json(camera) for name, camera in rig.cameras.items()},
         "unit": rig.unit,
-        "poses": {name: {"R": pose.R, "t": pose.t, "std": rig.std[name]} for name, pose in rig.poses.items()},
+        "poses": {
+            name: {"R": pose.R, "t": pose.t, "std": rig.pose_std[name]} for name, pose in rig.poses.items()
+        },
         "edges": [{"cameras": pair, "views": count} for pair, count in rig.edges.items()],
         "delays": {name: {"value": value, "std": std} for name, (value, std) in rig.delays.items()},
         **attributes(rig, "timed rmse_px max_px"),
-        "left_out": [[*view, why] for view, why in rig.left_out.items()],
+        "left_out": [[*view, why] for view, why in rig.views_left_out.items()],
         **outcome_json(rig),
     }
 

@@ -19,7 +19,7 @@ from neurocal_cli.commands.streams import print_summary, print_text, table_width
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
-    from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+    from neurocal_cli.calibration.rig.rig import Rig
 
 Table = list[list[str]]
 """Rows of cells, the heading first."""
@@ -208,7 +208,7 @@ def attributes(value: Any, names: str) -> dict[str, Any]:
     return {name or own: getattr(value, own) for name, _, own in words}
 
 
-def outcome_json(result: Calibration | StereoRig | Rig) -> dict[str, Any]:
+def outcome_json(result: Calibration | Rig) -> dict[str, Any]:
     """How the estimation of a result ended, for JSON."""
     ending = {"stop_reason": str.__str__(result.stop_reason), "warnings": result.warnings}
     return {"converged": result.converged, **ending, **verdict_json(result.verdict)}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -33,11 +33,9 @@ class AdaptedCameras:
     moved: tuple[Distance | None, ...] = ()  # shifts of the pixels of each camera
 
 
-def _parts(origin: Calibration | StereoRig | Rig) -> list[Calibration]:
+def _parts(origin: Calibration | Rig) -> list[Calibration]:
     """The calibrations in the contents of a neurocal file."""
-    if isinstance(origin, Rig):
-        return list(origin.cameras.values())
-    return [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
+    return [origin] if isinstance(origin, Calibration) else list(origin.cameras.values())
 
 
 def adapt_cameras(

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -57,7 +57,7 @@ class CameraSet:
     relative: tuple[Pose, ...] = ()  # from the first camera to each further one, X_k = R X_0 + t
     poses: Mapping[str, Pose] = field(default_factory=dict)  # of views, from the world to the first camera
     unit: str | None = None  # of the translations; None if the file does not state it
-    origin: Calibration | StereoRig | Rig | None = None  # the whole contents of a neurocal file
+    origin: Calibration | Rig | None = None  # the whole contents of a neurocal file
     program: str = "OpenCV"  # that wrote the file, for messages
     # Of a ROS file, as it is: rotation (3, 3) into the rectified frame, and projection (3, 4) from there.
     rectified: tuple[Array, Array] | None = None

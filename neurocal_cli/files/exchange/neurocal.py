@@ -55,14 +55,14 @@ def without_points(root: Field, camera: CameraSet) -> Calibration:
     return replace(calibration, covariance=covariance, covariance_names=names)
 
 
-def camera_set(result: Calibration | StereoRig | Rig) -> CameraSet:
+def camera_set(result: Calibration | Rig) -> CameraSet:
     """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
     cameras: tuple[Camera, ...]
     if isinstance(result, Rig):
         cameras = tuple(replace(one.camera, name=name) for name, one in result.cameras.items())
+        if isinstance(result, StereoRig):
+            cameras = result.left.camera, result.right.camera
         first, relative = result.cameras[result.first], tuple(result.poses.values())[1:]
-    elif isinstance(result, StereoRig):
-        cameras, first, relative = (result.left.camera, result.right.camera), result.left, (result.pose,)
     else:
         cameras, first, relative = (result.camera,), result, ()
     poses = {name: view.pose for name, view in first.views.items()}
@@ -122,7 +122,7 @@ def _calibration(cameras: CameraSet, k: int) -> Calibration:
     )
 
 
-def result_of(cameras: CameraSet) -> Calibration | StereoRig | Rig:
+def result_of(cameras: CameraSet) -> Calibration | Rig:
     """What a neurocal file of these cameras holds."""
     if len(cameras.cameras) > 2 or isinstance(cameras.origin, Rig):
         return as_rig(cameras)

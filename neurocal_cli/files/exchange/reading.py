@@ -9,7 +9,7 @@ from pathlib import Path
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.presented import Converted
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.errors import (
@@ -372,9 +372,7 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
     return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})
 
 
-def converted(
-    result: Calibration | StereoRig | Rig, to: str, model: str | None, force: bool, ending: str
-) -> Converted:
+def converted(result: Calibration | Rig, to: str, model: str | None, force: bool, ending: str) -> Converted:
     """Convert a result; see `Presented.convert`."""
     check_choice("to", to, tuple(FORMATS))
     adapted = adapt_cameras(replace(camera_set(result), unit=result.unit), FORMATS[to], force, model)

@@ -22,7 +22,7 @@ from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import match_views
 from neurocal_cli.calibration.rig.motion import motion_of, timed
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
-from neurocal_cli.calibration.rig.rig import Rig, of_two
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
@@ -104,7 +104,7 @@ def test_a_rig_is_found_from_random_weights(layout: str, n: int, frames: int) ->
     errors = errors_over_std(rig, truth)
     assert np.sqrt((errors**2).mean()) < 1.5
     assert np.abs(errors).max() < 4
-    assert not rig.left_out
+    assert not rig.views_left_out
     assert rig.converged
     # The minimum is that of a fit that starts at the truth.
     views = match_views({name: camera.points.view_names for name, camera in rig.cameras.items()})
@@ -158,7 +158,9 @@ def test_few_clean_rigs_are_accused() -> None:
         rig = calibrate_rig(points, skew=False)
         verdict = rig.verdict
         assert verdict is not None
-        accused += bool(rig.left_out) or any("camera cam" in why or "later" in why for why in verdict.reasons)
+        accused += bool(rig.views_left_out) or any(
+            "camera cam" in why or "later" in why for why in verdict.reasons
+        )
     assert accused <= 1
 
 
@@ -196,7 +198,7 @@ def test_two_fisheyes_back_to_back_share_what_is_beside_both() -> None:
         frames[f"{k:03d}"] = Pose(R, 350.0 * towards / np.linalg.norm(towards) - R @ board.mean(axis=0))
     truth = SimulatedRig({"left": camera, "right": camera}, mounted, board, frames)
     pair = calibrate_stereo(*truth.points(0.2, rng).values(), skew=False)
-    assert np.abs(errors_over_std(of_two(pair), truth)).max() < 4.5
+    assert np.abs(errors_over_std(pair, truth)).max() < 4.5
     assert pair.verdict is not None
     assert pair.verdict.word == "good"
     assert 0 < pair.verdict.measures["depth_share"] < 0.005
@@ -240,7 +242,7 @@ def test_a_camera_that_moved_is_named_and_its_larger_part_kept(at: int) -> None:
     other = moved(truth, "cam2", 0.5, 10.0).points(0.3, np.random.default_rng(9))["cam2"]
     points["cam2"] = joined(of_frames(points["cam2"], lambda k: k < at), of_frames(other, lambda k: k >= at))
     rig = calibrate_rig(points, skew=False)
-    assert {camera for camera, _ in rig.left_out} == {"cam2"}
+    assert {camera for camera, _ in rig.views_left_out} == {"cam2"}
     assert rig.verdict is not None
     assert rig.verdict.word == "poor"
     assert any("camera cam2 moved between" in why for why in rig.verdict.reasons)
@@ -255,8 +257,8 @@ def test_a_camera_that_is_late_is_found_and_compensated() -> None:
     points = now.points(0.3, rng)
     points["cam1"] = later.points(0.3, rng)["cam1"]
     found = calibrate_rig(points, skew=False)
-    assert ("cam1", "030") in found.left_out
-    assert len(found.left_out) <= 2
+    assert ("cam1", "030") in found.views_left_out
+    assert len(found.views_left_out) <= 2
     delay, std = found.delays["cam1"]
     assert delay == pytest.approx(0.4, abs=max(4 * std, 1e-9))
     assert std < 0.01
@@ -356,7 +358,7 @@ def test_the_exchanged_images_of_one_frame_are_named() -> None:
     for name, own, strange in (("cam1", one, other), ("cam2", other, one)):
         points[name] = joined(of_frames(own, lambda k: k != 4), of_frames(strange, lambda k: k == 4))
     rig = calibrate_rig(points, skew=False, distortion="k1k2", target="given")
-    assert rig.left_out == {
+    assert rig.views_left_out == {
         ("cam1", "004"): "exchanged with the image of camera cam2",
         ("cam2", "004"): "exchanged with the image of camera cam1",
     }
@@ -370,7 +372,7 @@ def test_a_wrong_view_is_left_out_and_the_others_of_its_frame_are_kept() -> None
     pixels = wrong.pixels.copy()
     pixels[rows] = other
     rig = calibrate_rig({**points, "cam2": replace(wrong, pixels=pixels)}, skew=False)
-    assert set(rig.left_out) == {("cam2", wrong.view_names[4])}
+    assert set(rig.views_left_out) == {("cam2", wrong.view_names[4])}
     assert len(rig.frames[points["cam0"].view_names[4]]) == 3
 
 
@@ -409,7 +411,7 @@ def test_two_cameras_are_the_stereo_rig() -> None:
     rig = calibrate_rig(points, skew=False)
     stereo = calibrate_stereo(points["cam0"], points["cam1"], skew=False)
     assert rig.poses["cam1"].t == pytest.approx(stereo.t, abs=1e-12)
-    assert rig.std["cam1"] == stereo.std
+    assert rig.pose_std["cam1"] == stereo.std
     verdicts = rig.pair("cam0", "cam1").verdict, stereo.verdict
     assert verdicts[0] is not None
     assert verdicts[1] is not None

@@ -35,7 +35,12 @@ def bent(rig: StereoRig) -> StereoRig:
         replace(c, distortion_model="plumb_bob", distortion=np.array(k))
         for c, k in ((rig.left, [-0.2, 0.05, 1e-3, -5e-4, 0]), (rig.right, [-0.15, 0.02, 0, 1e-3, 0]))
     ]
-    return replace(rig, left=cameras[0], right=cameras[1])
+    return replace(rig, cameras=dict(zip(("left", "right"), cameras, strict=True)))
+
+
+def posed(rig: StereoRig, pose: Pose) -> StereoRig:
+    """The rig with its right camera elsewhere."""
+    return replace(rig, poses={"left": rig.poses["left"], "right": pose})
 
 
 @pytest.mark.parametrize("alpha", [None, 0.0, 0.3, 1.0])
@@ -45,8 +50,8 @@ def test_opencv_says_the_same(name: str, alpha: float | None, rig: StereoRig) ->
     if alpha is not None and int(cv2.__version__.split(".")[0]) < 5:
         pytest.skip("before version 5 OpenCV lets images end a pixel further out")
     for one, tolerance in (
-        (replace(rig, pose=POSES[name]), 1e-4),
-        (replace(bent(rig), pose=POSES[name]), 3.0),
+        (posed(rig, POSES[name]), 1e-4),
+        (posed(bent(rig), POSES[name]), 3.0),
     ):
         found = rectify(one, alpha)
         assert found is not None
@@ -67,7 +72,7 @@ def test_opencv_says_the_same(name: str, alpha: float | None, rig: StereoRig) ->
 
 @pytest.mark.parametrize("name", POSES)
 def test_points_fall_on_one_row_and_q_brings_them_back(name: str, rig: StereoRig) -> None:
-    one = replace(rig, pose=POSES[name])
+    one = posed(rig, POSES[name])
     found = rectify(one, 0.5)
     assert found is not None
     rng = np.random.default_rng(2)
@@ -92,9 +97,9 @@ def test_points_fall_on_one_row_and_q_brings_them_back(name: str, rig: StereoRig
 
 def test_without_one_image_size_there_is_none(rig: StereoRig) -> None:
     nothing = replace(rig.left, points=replace(rig.left.points, image_size=None))
-    assert rectify(replace(rig, left=nothing)) is None
+    assert rectify(replace(rig, cameras={**rig.cameras, "left": nothing})) is None
     with pytest.raises(InputError, match="images of one known size"):
-        format_ros_pair(replace(rig, left=nothing))
+        format_ros_pair(replace(rig, cameras={**rig.cameras, "left": nothing}))
     with pytest.raises(UsageError, match="between 0 and 1"):
         rectify(rig, 2.0)
 
@@ -110,7 +115,7 @@ def test_ros_files_are_in_metres(rig: StereoRig) -> None:
     assert -P2[0, 3] / P2[0, 0] == pytest.approx(rig.baseline / 1000)
     points = replace(rig.left.points, unit="squares")
     with pytest.raises(InputError, match="'squares'; use one of m, dm, cm, mm"):
-        format_ros_pair(replace(rig, left=replace(rig.left, points=points)))
+        format_ros_pair(replace(rig, cameras={**rig.cameras, "left": replace(rig.left, points=points)}))
 
 
 @pytest.mark.parametrize("degrees", [90.0, 180.0, 270.0, 175.0])
@@ -118,7 +123,7 @@ def test_the_image_of_a_camera_upside_down_or_on_its_side_is_turned_up(
     degrees: float, rig: StereoRig
 ) -> None:
     turn = Pose.from_euler(0.0, 0.0, np.radians(degrees), np.zeros(3)).R
-    found = rectify(replace(rig, pose=Pose.exact(turn @ rig.R, turn @ rig.t)))
+    found = rectify(posed(rig, Pose.exact(turn @ rig.R, turn @ rig.t)))
     upright = rectify(rig)
     assert found is not None
     assert upright is not None
@@ -130,7 +135,7 @@ def test_the_image_of_a_camera_upside_down_or_on_its_side_is_turned_up(
 
 def test_cameras_back_to_back_are_not_rectified(rig: StereoRig) -> None:
     for angles in ((0.0, np.pi, 0.0), (np.radians(165.0), 0.0, 0.0)):
-        opposite = replace(rig, pose=Pose.from_euler(angles[0], angles[1], angles[2], rig.t))
+        opposite = posed(rig, Pose.from_euler(angles[0], angles[1], angles[2], rig.t))
         assert rectify(opposite) is None
         with pytest.raises(DegenerateGeometryError, match="face away from each other"):
             rectified_pair(opposite)

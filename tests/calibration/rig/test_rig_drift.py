@@ -11,7 +11,7 @@ from support.rigs import RigScene, random_rig, sides
 from neurocal_cli import Pose
 from neurocal_cli.calibration.drift import SHARE
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
-from neurocal_cli.calibration.rig.rig import Rig, named_std, of_two
+from neurocal_cli.calibration.rig.rig import Rig, named_std
 from neurocal_cli.calibration.rig.rig_drift import find_pose_drift, find_rig_drift
 from neurocal_cli.errors import InputError
 
@@ -25,7 +25,7 @@ def again(scene: RigScene, seed: int, kind: str = "verging", n_views: int = 10) 
 
 def calibrated(scene: RigScene, seed: int, sigma: float = 0.05) -> Rig:
     left, right = sides(scene, sigma, seed)
-    return of_two(calibrate_stereo(left, right, distortion="none", target="given", outliers="keep"))
+    return calibrate_stereo(left, right, distortion="none", target="given", outliers="keep")
 
 
 def test_a_camera_that_turned_and_one_that_moved_are_told_from_one_that_did_not() -> None:

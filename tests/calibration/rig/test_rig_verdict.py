@@ -20,7 +20,7 @@ from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 from neurocal_cli import calibrate, calibrate_stereo, fit_stereo, read_points, triangulate
 from neurocal_cli.calibration.rig.assessment import assess_rig, told_once
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
-from neurocal_cli.calibration.rig.rig import StereoRig, of_two
+from neurocal_cli.calibration.rig.rig import StereoRig
 from neurocal_cli.files.rig_yaml import read_stereo_rig
 from neurocal_cli.observations.points import Correspondences
 
@@ -54,7 +54,7 @@ def test_the_verdict_is_in_the_file_and_is_reached_again_from_it(bumped: Path) -
     rig = read_stereo_rig(bumped / "rig.yaml")
     assert rig.verdict is not None
     assert rig.verdict.word == "poor"
-    again = assess_rig(of_two(rig))
+    again = assess_rig(rig)
     assert again is not None
     assert (again.word, again.reasons, again.advice) == (
         rig.verdict.word,
