@@ -14,6 +14,7 @@ import numpy as np
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.rig import StereoRig
+from neurocal_cli.calibration.target_choice import on_one_target
 from neurocal_cli.camera.geometry import Array, rotation_step, rotation_vector
 from neurocal_cli.errors import NeurocalError
 from support.rigs import RigScene, corner, random_rig
@@ -308,7 +309,8 @@ def judged(points: Points) -> Outcome:
     """Calibrate two cameras and their rig, and judge it."""
     try:
         left, right = (_alone(side) for side in points)
-        rig = fit_rig({"left": left, "right": right}, refine_cameras=True).pair("left", "right")
+        sides = dict(zip(("left", "right"), on_one_target(left, right), strict=True))
+        rig = fit_rig(sides, refine_cameras=True).pair("left", "right")
     except NeurocalError as error:
         return Outcome("refused", (str(error),))
     verdict = rig.verdict

@@ -110,7 +110,7 @@ def test_a_rig_is_found_from_random_weights(layout: str, n: int, frames: int) ->
     views = match_views({name: camera.points.view_names for name, camera in rig.cameras.items()})
     problem = rig_problem(list(rig.cameras.values()), views.of_views)
     fit = adjust_rig(problem, problem.start(list(truth.relative.values())[1:]), problem.estimated_shared)
-    for k, (pose, std) in enumerate(zip(rig.poses.values(), rig.std.values(), strict=True)):
+    for k, (pose, std) in enumerate(zip(rig.poses.values(), rig.pose_std.values(), strict=True)):
         if k:
             apart = fit.state.t[k] * problem.unit - pose.t
             assert (np.abs(apart) < [0.2 * std[name] for name in ("t_x", "t_y", "t_z")]).all()
