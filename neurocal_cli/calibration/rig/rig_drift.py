@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from neurocal_cli.calibration.drift import FEW_VIEWS, SHARE, Drift, find_drift, tail
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_jacobian, rotation_vector
 from neurocal_cli.errors import InputError

@@ -56,12 +56,12 @@ def test_what_changed_in_a_rig_is_named() -> None:
 
 def test_of_several_cameras_the_knocked_one_is_named_even_if_it_is_the_first() -> None:
     pair = calibrated(random_rig(np.random.default_rng(3), "verging", 10), 1)
-    names, none = "abcd", dict.fromkeys(pair.std["right"], 0.0)
+    names, none = "abcd", dict.fromkeys(pair.std, 0.0)
     poses = {name: Pose(np.eye(3), np.array([100.0 * k, 0, 0])) for k, name in enumerate(names)}
     covariance = np.diag(np.tile([1e-6] * 3 + [0.01] * 3, 3))
     std = {name: none if name == "a" else named_std(covariance[:6, :6], poses[name].t) for name in names}
     cameras = dict.fromkeys(names, pair.cameras["left"])
-    rig = replace(pair, cameras=cameras, poses=poses, std=std, covariance=covariance)
+    rig = replace(pair, cameras=cameras, poses=poses, pose_std=std, covariance=covariance)
     turn = Pose.from_euler(0.0, 0.05, 0.0, np.zeros(3)).R
 
     def knocked(*some: str) -> Rig:
