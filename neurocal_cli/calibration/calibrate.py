@@ -164,46 +164,29 @@ def calibrate(
     InputError, DegenerateGeometryError
         The points do not determine the camera; the message says why.
     """
+    asked: CameraOptions = {
+        "type": type, "image_center": image_center, "intrinsics": intrinsics, "extrinsics": extrinsics,
+        "method": method, "trainer": trainer, "distortion": distortion, "skew": skew, "outliers": outliers,
+        "seed": seed, "target": target, "preferred": preferred, "fix": fix, "square_pixels": square_pixels,
+        "starts": starts, "backprop": backprop,
+    }  # fmt: skip
     if points.image is not None:
-        from neurocal_cli.calibration.arranged_boards import arranged
-
         if start is not None:
             raise UsageError("start needs one board in each image, but some have several; leave it out")
-
-        def fitted(some: Mapping[str, Correspondences], target: TargetChoice | Target) -> Calibration:
-            return calibrate(
-                some[camera_name], type, image_center, intrinsics, extrinsics, method, trainer, distortion,
-                skew, outliers, seed, target=target, preferred=preferred, fix=fix,
-                square_pixels=square_pixels, starts=starts, backprop=backprop, camera_name=camera_name,
-                progress=progress,
-            )  # fmt: skip
-
-        several, told = arranged({camera_name: points}, target, fitted, lambda found: {camera_name: found})
-        return replace(several, warnings=(*told, *several.warnings))
+        return _of_several_boards(points, asked, camera_name, progress)
+    choice = "given" if isinstance(target, Target) else target
+    _check(asked, choice, start)
+    angle = _angle_of(skew, square_pixels, distortion, fix)
     known_target = target if isinstance(target, Target) else None
     if known_target is not None and known_target.bends is not None:  # cameras of a rig share the same one
         known_target = replace(known_target, bends=None)
-    choice = "given" if isinstance(target, Target) else target
-    if starts < 2:
-        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
-    check_seed(seed)
-    needing = {
-        "fix": fix, "start": start, "square_pixels": square_pixels, "skew auto": skew == "auto",
-        f"target {choice}": choice in ("flat", "free"),
-        f"distortion {distortion}": distortion in ("plumb-line", "rich"),
-    }  # fmt: skip
-    if method != "neuro" and (named := next((name for name, given in needing.items() if given), None)):
-        raise UsageError(f"{named} needs the method neuro, but the method is {method}; leave it out")
-    if backprop is not None and trainer != "backprop":
-        raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
-    angle = _angle_of(skew, square_pixels, distortion, fix)
     if known_target is not None:
         points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)
     known = None if given is None else given.intrinsics
-    if isinstance(extrinsics, Calibration):
-        extrinsics = {name: view.pose for name, view in extrinsics.views.items()}
     poses = extrinsics
+    if isinstance(poses, Calibration):
+        poses = {name: view.pose for name, view in poses.views.items()}
     model, way = _lens_of(type, method, distortion, given)
     options = options_for(
         trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
@@ -238,12 +221,51 @@ def calibrate(
     return replace(found, warnings=(*found.warnings, *unused, *undone), judgement=assess)
 
 
+def _of_several_boards(
+    points: Correspondences, asked: CameraOptions, camera_name: str, progress: Progress | None
+) -> Calibration:
+    """Calibrate from images of several boards, which may be fixed to each other."""
+    from neurocal_cli.calibration.arranged_boards import arranged
+
+    def fitted(some: Mapping[str, Correspondences], target: TargetChoice | Target) -> Calibration:
+        again: CameraOptions = {**asked, "target": target}
+        return calibrate(some[camera_name], **again, camera_name=camera_name, progress=progress)
+
+    one = {camera_name: points}
+    found, told = arranged(one, asked["target"], fitted, lambda found: {camera_name: found})
+    return replace(found, warnings=(*told, *found.warnings))
+
+
+def _check(asked: CameraOptions, choice: str, start: Calibration | None) -> None:
+    """Refuse options that do not go together; the choice is that of the target."""
+    method, trainer, distortion = asked["method"], asked["trainer"], asked["distortion"]
+    if asked["starts"] < 2:
+        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
+    check_seed(asked["seed"])
+    needing = {
+        "fix": asked["fix"],
+        "start": start,
+        "square_pixels": asked["square_pixels"],
+        "skew auto": asked["skew"] == "auto",
+        f"target {choice}": choice in ("flat", "free"),
+        f"distortion {distortion}": distortion in ("plumb-line", "rich"),
+    }
+    if method != "neuro" and (named := next((name for name, given in needing.items() if given), None)):
+        raise UsageError(f"{named} needs the method neuro, but the method is {method}; leave it out")
+    if asked["backprop"] is not None and trainer != "backprop":
+        raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
+
+
 def _explained(error: DegenerateGeometryError, points: Correspondences, type: int) -> str:
     """A refusal with its true cause, the views that are given twice, and the points' file.
 
     The code that raised it does not know these.
     """
-    text, copies = _true_cause(points, type) or str(error), repeated_views(points)
+    from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
+    from neurocal_cli.calibration.verdict.proportions import unlike_axes
+
+    true = mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None)
+    text, copies = "; ".join(true or ()) or str(error), repeated_views(points)
     if copies:
         text += (
             f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "
@@ -252,14 +274,6 @@ def _explained(error: DegenerateGeometryError, points: Correspondences, type: in
     if points.lines is not None and not text.startswith(points.source):
         text = f"{points.source}: {text}"
     return text
-
-
-def _true_cause(points: Correspondences, type: int) -> str:
-    """Why points are refused, if it is another cause than what the refusal says; else ""."""
-    from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
-    from neurocal_cli.calibration.verdict.proportions import unlike_axes
-
-    return "; ".join(mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None) or ())
 
 
 def _angle_of(skew: bool | str, square_pixels: bool, distortion: str, fix: Mapping[str, float] | None) -> str:
