@@ -113,11 +113,14 @@ def fit_robustly(
         if contradicts or rms(first) > MISFIT * pixel_spread(problem.points):
             raise
         return first, Rejected()
-    falls, spare = rms(solution) < _FALLS * rms(first), solution.spare_equations
-    if spare < max(_FEW, _FEW_EACH * problem.n_parameters):
-        better = (falls and spare >= _FEW) or _is_more_probable(kept, solution, first)
+    except DegenerateGeometryError:  # of few points, what agrees best may be less than half
+        if rough or not _has_few_spare_equations(first):
+            raise
+        return first, Rejected()
+    if _has_few_spare_equations(solution):
+        better = _is_more_probable(kept, solution, first)
     else:
-        better = contradicts or falls
+        better = contradicts or rms(solution) < _FALLS * rms(first)
     if not better:
         return first, Rejected()
     return solution.noted(of_all=first), _rejected(problem.points, kept, solution)
@@ -130,6 +133,10 @@ def _searched(
     kept, solution = _without_outlier_views(points, options, kept, solution)
     kept, solution = _all_judged(points, options, kept, solution)
     return _with_fitting_views(points, options, kept, solution)
+
+
+def _has_few_spare_equations(solution: Solution) -> bool:
+    return solution.spare_equations < max(_FEW, _FEW_EACH * solution.problem.n_parameters)
 
 
 def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:
