@@ -47,13 +47,13 @@ def similar_states(
     model: str,
     farthest: float,
     xi: Array | None = None,
-    held: Collection[str] = (),
+    lacking: Collection[str] = (),
 ) -> list[CameraState]:
     """States of another model with nearly the same image, the most similar first; same poses and centre.
 
     The state is of one camera, and angles up to the `farthest` [rad] are compared. If values of xi are given,
     there is one state for each of them, in rising order, without those that have no similar lens.
-    Coefficients that are `held` stay 0.
+    Coefficients that are `lacking` stay 0.
     """
     own = coefficient_names(state.model)
     if model not in WIDE and state.model != model and coefficient_names(model)[: len(own)] == own:
@@ -65,7 +65,7 @@ def similar_states(
     if len(theta) < 10:
         return []
     grid = _compared(model, _XI.get(model, _ALPHA) if xi is None else xi)
-    columns = _columns(model, grid, theta, held)  # (G, m, c)
+    columns = _columns(model, grid, theta, lacking)  # (G, m, c)
     with np.errstate(invalid="ignore", divide="ignore"):
         usable = np.asarray(np.isfinite(columns).all(axis=(1, 2)))
     columns = np.where(usable[:, None, None], columns, 0.0)
@@ -130,7 +130,7 @@ def _compared(model: str, xi: Array) -> Array:
     return np.zeros((1, 0))
 
 
-def _columns(model: str, grid: Array, theta: Array, held: Collection[str]) -> Array:
+def _columns(model: str, grid: Array, theta: Array, lacking: Collection[str]) -> Array:
     """(G, m, c) derivatives of the radius by the scale and by the scale times each linear coefficient."""
     if model in WIDE and model != "fisheye":
         n_linear = 2 if model == "omnidir" else 0
@@ -141,13 +141,13 @@ def _columns(model: str, grid: Array, theta: Array, held: Collection[str]) -> Ar
         m = np.where(seen, x, np.nan)
         return m[..., None] ** np.arange(1, 2 * n_linear + 2, 2)
     m = theta if model == "fisheye" else np.where(theta < 0.5 * np.pi - _SPARE, np.tan(theta), np.nan)
-    return np.asarray(m[None, :, None] ** np.arange(1, 2 * len(_linear_names(model, held)) + 2, 2))
+    return np.asarray(m[None, :, None] ** np.arange(1, 2 * len(_linear_names(model, lacking)) + 2, 2))
 
 
-def _linear_names(model: str, held: Collection[str] = ()) -> list[str]:
+def _linear_names(model: str, lacking: Collection[str] = ()) -> list[str]:
     """Radial coefficients in which the radius is linear, by rising power; none of a denominator."""
     names = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "k3")
-    return [name for name in coefficient_names(model) if name in names and name not in held]
+    return [name for name in coefficient_names(model) if name in names and name not in lacking]
 
 
 def _lowest(error: Array, part: NDArray[Any]) -> list[int]:

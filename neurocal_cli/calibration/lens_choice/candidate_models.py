@@ -377,9 +377,9 @@ def _terms(model: str, reach: float) -> Array:
 
 
 def _started(problem: Problem, state: CameraState) -> CameraState:
-    """The state with the problem's model, and nearly the same image."""
-    model, held = problem.distortion.model, problem.fixed
-    if state.model == model:
+    """The state with the problem's model, and nearly the same image; coefficients that it lacks are 0."""
+    model, lacking = problem.distortion.model, problem.fixed - problem.held.keys()
+    if state.model == model and not state.k[[name in lacking for name in coefficient_names(model)]].any():
         return state
-    similar = similar_states(state, model, farthest_angle(problem.views, state), held=held)
+    similar = similar_states(state, model, farthest_angle(problem.views, state), lacking=lacking)
     return similar[0] if similar else replace(state, model=model, k=pinhole_coefficients(model))

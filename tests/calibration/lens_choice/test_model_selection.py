@@ -15,7 +15,8 @@ from support.scenes import Scene, random_solid, table_1
 from support.slow_cases import slow_but
 
 from neurocal_cli import Board, Calibration, Correspondences, calibrate, detect_points, read_image
-from neurocal_cli.calibration.lens_choice.candidate_models import _Chain
+from neurocal_cli.adjustment.problem import normalised, problem_for
+from neurocal_cli.calibration.lens_choice.candidate_models import _Chain, fit_candidates
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import DegenerateGeometryError
 
@@ -126,6 +127,18 @@ def test_what_a_fisheye_leaves_out_the_others_have_when_a_point_is_set_aside() -
     assert found.distortion_model == "fisheye"
     assert "k4" in found.fixed
     assert found.lens_choice == pytest.approx(clean.lens_choice, rel=1e-3)
+
+
+def test_coefficients_that_a_fisheye_leaves_out_are_zero_whatever_it_starts_from() -> None:
+    scene, _ = bent_set("fisheye", 1)
+    points = scene.points(SIGMA, np.random.default_rng([1, 1]))
+    whole = calibrate(points, skew=False, distortion="fisheye", outliers="keep", target="given")
+    problem = problem_for(points, 1, skew=False)
+    start = normalised(whole.state(problem.views.names), problem.views)
+    found = fit_candidates(problem, start, by_views=False)["fisheye"]
+    left_out = [name in found.problem.fixed for name in MODELS["fisheye"]]
+    assert any(left_out)
+    assert not found.adjusted.state.k[left_out].any()
 
 
 def test_the_alternatives_are_told() -> None:
