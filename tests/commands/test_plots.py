@@ -78,7 +78,7 @@ def test_each_panel_of_a_camera_is_a_picture(panel: str) -> None:
 def test_a_camera_without_a_calibration_is_drawn_with_the_points_it_was_judged_by() -> None:
     cal = made_calibration(2)
     subject = Subject.of(cal.camera, cal.points)
-    assert subject.evidence is None
+    assert subject.calibration is None
     assert b"known only of a calibration" in draw_camera(subject, "svg", "uncertainty").replace(
         b"&#x20;", b" "
     )
