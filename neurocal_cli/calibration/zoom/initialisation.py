@@ -43,8 +43,9 @@ from neurocal_cli.observations.points import Correspondences
 # The static calibrations are near the minimum, but not at it.
 _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 _QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
-# A richer model must lower the cross-validation error to this share and the residual variance by so many
-# standard deviations. The tests of the choice in test_zoom_lens.py have both outcomes.
+# A richer model must lower the residuals by more than its coefficients do by chance, and the cross-validation
+# error to this share or at so many standard deviations over the settings. The tests of the choice in
+# test_zoom_lens.py have both outcomes.
 _LARGEST_SHARE = 0.98
 _SIGMAS = 3.0
 # Times the median rms error of the settings. As a lens may change sharply between two settings, the limit is
@@ -140,7 +141,7 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
     best: CalibratedSettings | None = None
     failure: DegenerateGeometryError | None = None
-    best_px: float | None = None  # computed when a richer model is compared
+    known: dict[tuple[float, ...], float] = {}  # computed when a richer model is compared
     for model in POLYNOMIAL_MODELS:
         try:
             start = calibrate_settings(lens, model, options)
@@ -150,25 +151,39 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
         if best is None:
             best = start
             continue
-        noise = np.sqrt(2 / start.data.views.n_equations)  # of a variance, as a share of it
-        if not start.variance < best.variance * (1 - _SIGMAS * noise):
+        if len(start.rejected) < len(best.rejected):  # a setting that a richer lens follows is not wrong
+            best, known = start, {}
+            continue
+        # The gain of coefficients that are noise is chi-squared, with a mean that the variances allow for.
+        more = start.lens.n_settings * (len(start.data.names) - len(best.data.names))
+        gain = (best.variance / start.variance - 1.0) * start.data.views.n_equations
+        if not gain > _SIGMAS * np.sqrt(2.0 * more):
             continue
         options.report(f"trying distortion model {model}", 0.5)
-        best_px = _held_out(best, options) if best_px is None else best_px
-        error_px = _held_out(start, options)
-        if error_px < _LARGEST_SHARE * best_px:
-            best, best_px = start, error_px
+        known = known or _held_out(best, options)
+        errors = _held_out(start, options)
+        if _predicts_better(errors, known):
+            best, known = start, errors
     if best is None:
         assert failure is not None
         raise failure
     return best
 
 
-def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
-    """Twofold cross-validation error [px]: every second setting is predicted from the others."""
+def _predicts_better(errors: dict[tuple[float, ...], float], others: dict[tuple[float, ...], float]) -> bool:
+    """Whether mean squared errors of held-out settings are lower than others, by much or significantly."""
+    both = [setting for setting in errors if setting in others]
+    one, two = (np.array([some[setting] for setting in both]) for some in (errors, others))
+    ratio = np.log(two / one)
+    significant = ratio.sum() > _SIGMAS * np.sqrt(len(ratio)) * ratio.std()
+    return bool(one.sum() < _LARGEST_SHARE**2 * two.sum() or significant)
+
+
+def _held_out(start: CalibratedSettings, options: FitOptions) -> dict[tuple[float, ...], float]:
+    """Twofold cross-validation: each setting's squared error [px^2], predicted from every second setting."""
     x = start.controls
     inside = np.arange(len(x)) % 2 == 0
-    squares = 0.0
+    squares = np.zeros(len(x))
     for part in (inside, ~inside):
         rng, names, local = np.random.default_rng(options.seed), start.data.names, start.tables.local
         H = start.tables.normal.S[part]
@@ -178,8 +193,9 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
         predicted = np.mean([nets.local(x) for nets in members], axis=0)
         there = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
         cost = there.normal.cost
-        squares += float(cost[~part].sum()) if np.isfinite(cost).all() else np.inf
-    return float(np.sqrt(squares / len(start.lens.points)))
+        squares[~part] = cost[~part] if np.isfinite(cost).all() else np.inf
+    settings = map(tuple, start.lens.settings.tolist())
+    return dict(zip(settings, (squares / start.data.counts).tolist(), strict=True))
 
 
 def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:

@@ -31,6 +31,10 @@ from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
 from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens, camera_at
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import rotation_step
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.observations.points import Correspondences
 
@@ -255,9 +259,38 @@ def test_a_lens_of_a_moving_board() -> None:
     assert np.isfinite(evaluation.baselines["spline_joint"])
 
 
-def board_view(alpha: float, u0: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    from neurocal_cli.camera.geometry import rotation_step
+@pytest.mark.slow
+def test_decentring_that_lowers_the_error_by_little_is_chosen() -> None:
+    """Each setting alone takes p1 and p2 for a shift of the centre, and the error grows by 1 % only."""
+    rng, board = (
+        np.random.default_rng(5),
+        np.array([(60.0 * x, 60.0 * y, 0.0) for y in range(8) for x in range(11)]),
+    )
+    worlds, pixels, names, zoom = [], [], [], []
+    truth: dict[float, float] = {}
+    for z in np.repeat(np.linspace(24.0, 70.0, 12), 5).tolist():
+        truth[z] = 750 + 6 * np.sin((z - 24) / 20)
+        entries = Intrinsics(41.7 * z, 41.7 * z, truth[z], 500 - 4 * np.cos((z - 24) / 25))
+        k = [-0.11 + 0.002 * (z - 24), 0.05, 3e-4 * np.sin((z - 24) / 15), -4e-4 * np.cos((z - 24) / 18)]
+        camera = Camera(entries, Distortion("k1k2p1p2", np.array(k)), (1500, 1000))
+        R = rotation_step(rng.uniform(-0.6, 0.6, (1, 3)))[0]
+        depth = 41.7 * z * 0.44 * rng.uniform(1.2, 1.9)
+        centre = np.append(depth / (41.7 * z) * rng.uniform(-250, 250, 2), depth)
+        seen_at, _ = camera.project((board - [300.0, 210.0, 0.0]) @ R.T + centre)
+        worlds.append(board)
+        pixels.append(seen_at + 0.07 * rng.normal(size=seen_at.shape))
+        names += [f"view{len(worlds)}"] * len(board)
+        zoom += [z] * len(board)
+    points = Correspondences(np.concatenate(worlds), np.concatenate(pixels), names, (1500, 1000))
+    lens = fit_lens(LensPoints.grouped(points, {"zoom": np.array(zoom)}), skew=False, target="given")
+    assert lens.model == "k1k2p1p2"
+    away = [
+        (lens.predict([[z]]).local[0, 2] - u0) / camera_at(lens, [z]).std["u0"] for z, u0 in truth.items()
+    ]
+    assert np.sqrt(np.mean(np.square(away))) < 2.0
 
+
+def board_view(alpha: float, u0: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     board = np.column_stack(
         [(np.stack(np.meshgrid(range(8), range(6)), -1).reshape(-1, 2) - [3.5, 2.5]) * 25, np.zeros(48)]
     )
