@@ -178,10 +178,11 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     found = np.full(grid.shape, np.nan)
     contrast = np.full(grid.shape[:2], np.nan)
     corners, pixels = placed.ground.reshape(-1, 2), placed.marks.corners.reshape(-1, 2)
-    flattening = flattening_of(corners, pixels, (image.shape[1], image.shape[0]))
     dark = int(placed.how.legacy)  # the cell at (c, r) is dark where c + r plus this is even
     count = 0
     while True:
+        # The few markers that are read before a fisheye may flatten the others wrongly; vertices do better.
+        flattening = flattening_of(corners, pixels, (image.shape[1], image.shape[0]))
         missing = np.isnan(contrast)
         at = np.argwhere(missing)
         start, cell = predicted(ground[missing], corners, pixels, flattening)
