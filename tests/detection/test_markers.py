@@ -16,8 +16,11 @@ from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.uneven_light import half_in_shadow
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.saddles import grey_levels
 from neurocal_cli.detection.fitting.batched_newton import BLUR
@@ -542,6 +545,21 @@ def test_all_vertices_of_photographs_are_found(real_files: RealFiles) -> None:
         images = real_files(f"charuco_lifecam/{name}*.jpg")
         found = [detect_points(read_image(path).grey, board, "vertices") for path in images]
         assert sum(len(one.ids) for one in found) >= least
+
+
+@pytest.mark.parametrize("seed", slow_but((9702,), (9702, 9707)))
+def test_tags_that_are_not_read_before_a_fisheye_are_found_from_the_others(seed: int) -> None:
+    """In the second, a saddle point far from all others is none of the board's."""
+    flat = marked_scene(plane_of("aprilgrid:6x4:40:0.3"), seed, 67.6, (960, 720))
+    focal, old = 960 / np.pi, flat.camera.intrinsics
+    lens = Camera(
+        Intrinsics(focal, 1.003 * focal, old.u0, old.v0), Distortion("fisheye", (0.0,) * 4), (960, 720)
+    )
+    near = replace(flat.pose, t=flat.pose.t * [1.0, 1.0, focal / old.alpha_u])
+    picture = taken(replace(flat, camera=lens, pose=near), seed, 2 if seed == 9702 else 3)
+    error, _ = errors_of(detect_points(picture.image, flat.board, "vertices"), picture)
+    assert len(error) == 96  # 74 and 82
+    assert np.abs(error).max() < 0.05
 
 
 def test_a_stray_far_beside_a_fisheyes_board_hides_no_other_stray() -> None:

@@ -238,7 +238,8 @@ def leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: F
     while (seen := np.isfinite(contrast)).sum() > _FEWEST_AROUND:
         places, pixels = ground[seen], found[seen]
         start, cell = predicted(places, places, pixels, flattening, itself=False)
-        off = np.hypot(*(pixels - start).T)
+        # No others tell where one that is alone should be.
+        off = np.nan_to_num(np.hypot(*(pixels - start).T), nan=np.inf)
         side = np.sqrt(np.abs(np.linalg.det(cell)))
         near = np.abs(places[:, None] - places).max(axis=2) < _AROUND
         stray = (off > _STRAY * side + _STRAY_PX) & (off >= np.where(near, off, 0.0).max(axis=1))
