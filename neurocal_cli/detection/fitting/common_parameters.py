@@ -42,7 +42,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     tail_terms,
 )
 from neurocal_cli.detection.fitting.map_fit import MapFit, WideMap
-from neurocal_cli.detection.fitting.shading import Shading, excess_nearby, excess_variance, polynomial_terms
+from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single
 from neurocal_cli.detection.medians import upper_median
@@ -170,16 +170,14 @@ def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:
     return replace(shape, nonlinearity=shape.nonlinearity + change)
 
 
-def with_gradients(
-    fit: BatchFit, along: tuple[Single, Single], of_blur: bool, place: Array | None
-) -> BatchFit:
+def with_gradients(fit: BatchFit, along: tuple[Single, Single], of_blur: bool, bent: bool) -> BatchFit:
     """Continue fits by a step that also fits gradients of the light, and of the blur, along two axes (E, N).
 
     Gradients that shading and blur of the board do not contain displace an edge, or a vertex, where opposite
     squares then differ. They are relative to light and blur, and have normal priors. The variance of a prior
     is what the estimates scatter more than by their errors. In even light and focus this is nothing, and the
-    fits stay as they are. Where the light follows nearby levels, this is the scatter around each `place`
-    (E, 2) [px], and the light may bend: it has second powers of the coordinates, too.
+    fits stay as they are. Where the light is `bent`, as beside a shadow, it has second powers of the
+    coordinates, too, and each fit tells its own variances: others nearby may lie beyond the border.
     """
     data, rows, size = fit.pixels, fit.linear.rows, fit.values.shape[1]
     mean, contrast, sigma = fit.values[:, MEAN:].T.astype(np.float32)[:, :, None]
@@ -189,7 +187,7 @@ def with_gradients(
     if of_blur:
         wider = rows[:, 1 + size + BLUR] * sigma
         patterns += [wider * a, wider * b]
-    if place is not None:
+    if bent:
         patterns += [light * a * a, light * a * b, light * b * b]
     changes = np.stack(patterns, axis=1)
     # Products with the residual, with the derivatives by the values, and with each other.
@@ -205,10 +203,11 @@ def with_gradients(
     free = np.linalg.inv(left)
     variance, found = np.einsum("eii->ei", free), (free @ right)[:, :, 0]
     believed = np.zeros_like(variance)
-    for kind in np.split(np.arange(len(patterns)), [2, 4][: of_blur + (place is not None)]):
+    for kind in np.split(np.arange(len(patterns)), [2, 4][: of_blur + bent]):
         own = variance[:, kind]
-        if place is not None:
-            believed[:, kind] = excess_nearby(place, found[:, kind], own)
+        if bent:
+            excess = (found[:, kind] ** 2 - own).mean(axis=1, keepdims=True)
+            believed[:, kind] = np.maximum(excess, 0.0)
         elif (spread := excess_variance(found[:, kind].ravel(), own.ravel())) > _NOTABLE * upper_median(own):
             believed[:, kind] = spread
     used = np.flatnonzero(believed.any(axis=0))

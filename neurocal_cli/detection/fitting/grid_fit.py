@@ -339,7 +339,7 @@ def _fine_fit(
         fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
     if isinstance(shading, LocalShading) and isinstance(fit.pixels, EdgePixels):
         along = fit.pixels.d, fit.pixels.lever * (0.5 * lines.length).astype(np.float32)[:, None]
-        fit = with_gradients(fit, along, False, lines.middle)
+        fit = with_gradients(fit, along, of_blur=False, bent=True)
     return fit, noise
 
 

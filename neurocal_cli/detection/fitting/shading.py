@@ -35,7 +35,6 @@ _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 _EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which polynomials are sufficient
 _CLEARLY = 0.8  # ratio of errors below which a richer description of the light predicts levels better
 _FEWEST = 3  # levels that are more than this are followed
-_NEARBY = 2  # the same of fits whose gradients tell about those of others nearby
 _LEAST_SPREAD = 0.1  # least variance of single levels around others, in variances of a level
 _FAR = 1e-5  # weight of levels far away, which determines a plane where nearby ones do not
 
@@ -146,12 +145,6 @@ def _nearness(near: Array, place: Array, nearest: int, itself: bool = True) -> A
     width = np.partition(away, nearest, axis=1)[:, nearest]
     weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
     return np.asarray(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
-
-
-def excess_nearby(place: Array, residual: Array, variance: Array) -> Array:
-    """Variance (N, 1) of residuals (N, K) around places (N, 2) beyond twice their known variances (N, K)."""
-    excess = (residual**2 - 2 * variance).mean(axis=1, keepdims=True)
-    return np.maximum(_nearness(place, place, _NEARBY) @ excess, 0.0)
 
 
 def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels, float]:

@@ -95,8 +95,8 @@ def fit_grid_vertices(
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
     fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
     fit = without_outlying_pixels(fit, STEPS)
-    beside = place if isinstance(fitted.shading, LocalShading) else None
-    fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), beside)
+    bent = isinstance(fitted.shading, LocalShading)
+    fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), bent)
     if fitted.shifts.used:
         fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), LEAST_SCALE))
