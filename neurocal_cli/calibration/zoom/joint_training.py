@@ -352,12 +352,7 @@ def most_suspect(pixels: Array, normalised: Array) -> int | None:
 
 
 def contradiction(lens: ZoomLens, start: CalibratedSettings, s: int) -> str | None:
-    """Reason to reject setting s of the start, given a lens that was fitted without it; None to keep it.
-
-    Its own camera witnesses against it, so it has to determine one.
-    """
-    if not start.static.good[s]:
-        return None
+    """Reason to reject setting s of the start, given a lens that was fitted without it; None to keep it."""
     try:
         prediction = lens.predict(start.lens.settings[s : s + 1])
     except InputError:  # no valid camera there, because another setting is wrong
