@@ -170,6 +170,9 @@ class _Chain:
             fisheyes = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
             n = worth(self.problem.views, fisheyes)
             fitted["fisheye"] = min(fisheyes, key=lambda candidate: candidate.criterion(n))
+            for simple in _CHAIN[-2:0:-1]:
+                if simple not in fitted:  # from the pinhole, it did not converge
+                    self._fit_again(simple, "fisheye", fitted)
             decentred = self._decentred(fitted["fisheye"], first)
             if decentred is not None:
                 fitted["omnidir"] = decentred

@@ -108,6 +108,13 @@ def test_a_lens_that_the_points_do_not_determine_is_not_selected_in_the_end() ->
     assert abs(found.intrinsics.alpha_u - truth.A[0, 0]) < 3.0 * found.std["alpha_u"]
 
 
+def test_polynomials_that_a_pinhole_does_not_reach_start_from_the_fisheye() -> None:
+    points, truth = campaign_scene(910141)  # k1k2 and richer ones were missing, and the fisheye won
+    found = calibrate(points)
+    assert found.distortion_model == "k1k2"
+    assert abs(found.intrinsics.alpha_u - truth.A[0, 0]) < 3.0 * found.std["alpha_u"]
+
+
 @pytest.mark.parametrize("seed", [23, 43])
 def test_of_three_views_none_can_be_spared_to_choose_a_lens(seed: int) -> None:
     scene, _ = bent_set("k1k2", seed)
