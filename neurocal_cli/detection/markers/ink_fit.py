@@ -226,10 +226,11 @@ def _profiles(
     every = np.arange(len(d))
     k, j = np.divmod(costs.reshape(-1, len(d)).argmin(axis=0), len(offsets))
     # The least of the parabola through the costs of three offsets.
-    before, here, after = (costs[k, np.clip(j + step, 0, len(offsets) - 1), every] for step in (-1, 0, 1))
+    three = np.stack([costs[k, np.clip(j + step, 0, len(offsets) - 1), every] for step in (-1, 0, 1)])
+    inner = (j > 0) & (j < len(offsets) - 1) & np.isfinite(three).all(axis=0)
+    before, here, after = np.where(inner, three, 0.0)
     bend = before - 2 * here + after
-    inner = np.isfinite(bend) & (bend > 0) & (j > 0) & (j < len(offsets) - 1)
-    part = 0.5 * np.divide(before - after, bend, out=np.zeros(len(d)), where=inner)
+    part = 0.5 * np.divide(before - after, bend, out=np.zeros(len(d)), where=bend > 0)
     found = offsets[j] + part * (offsets[1] - offsets[0])
     return np.column_stack([values[k, j, every], sigmas[k]]), found
 
