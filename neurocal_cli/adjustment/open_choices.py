@@ -62,6 +62,10 @@ _DECENTRED = (*_FISHEYE, (("p1", "p2"), 1, 0.0015))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
 _ODDS = {1.0: 3.0}  # prior odds that a group of the typical size is present
+# A fisheye that stands for an ordinary lens, whose polynomials fold in the corners: such lenses have p1 and
+# p2, and those of most are small.
+_ODDS_ORDINARY = {1.0: 100.0, 0.1: 100.0}
+WIDE_REACH = 0.7  # least radius of the points of a wide lens: 35 degrees from the axis
 _SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above and below
 
 
@@ -138,6 +142,7 @@ def open_at_points(
     model = state.model
     own = coefficient_names(model)
     wide = model == "fisheye"
+    ordinary = wide and reach < WIDE_REACH
     richer = DECENTRED[model] if wide else next((m for m in POLYNOMIAL_MODELS[::-1] if m in tried), "none")
     names = coefficient_names(richer)
     if not tried or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
@@ -167,7 +172,7 @@ def open_at_points(
         np.where(left_out, 0.0, np.append(np.zeros(int(free[:5].sum())), reported))[is_open],
         size,
         tuple(groups),
-        (_ODDS,) * len(groups),
+        tuple(_ODDS_ORDINARY if ordinary and open_names[k[0]] == "p1" else _ODDS for k in groups),
     )
     return OpenCoefficients(richer, reported, everything, prior)
 

@@ -13,7 +13,7 @@ from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_v
 from neurocal_cli.adjustment.free_networks import least_of_free_networks
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.observability import is_weak, refuse_undetermined
-from neurocal_cli.adjustment.open_choices import radius
+from neurocal_cli.adjustment.open_choices import WIDE_REACH, radius
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
@@ -50,7 +50,6 @@ _PROMISING = 4.0
 _ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
 _SPARE = 0.3  # fewest equations beyond the unknowns, per unknown of the camera and one pose
-_WIDE = 0.7  # least radius of the points for a fisheye model: 35 degrees from the axis
 _TOLD_APART = 4.0  # squared standard deviations per coefficient that differ significantly from 0
 # Chi-squared of p1 and p2 of a wide lens: photographs whose p1 is 2.5 std, counted by views, reach 35.
 _DECENTRED = 40.0
@@ -208,7 +207,7 @@ class _Chain:
         if candidate is not None and candidate.cost < cost:
             fitted[simple] = candidate
 
-    def _fisheyes(self, state: CameraState, least: float = _WIDE) -> list[Candidate]:
+    def _fisheyes(self, state: CameraState, least: float = WIDE_REACH) -> list[Candidate]:
         """Fit fisheyes with one, two and four coefficients, each from the previous one.
 
         There are none if all points are nearer to the axis than the `least` radius.

@@ -106,11 +106,10 @@ def test_points_that_deny_every_lens_without_a_fold_are_refused() -> None:
         calibrate(points, distortion="k1", skew=False)
 
 
-@pytest.mark.parametrize(("alpha", "k"), [(675.0, [-0.32, 0.04]), (1660.0, [-0.71, 0.07])])
-def test_points_near_the_fold_of_a_true_lens_do_not_make_it_a_pinhole(alpha: float, k: list[float]) -> None:
-    """Corners beyond the image of 50 or 30 degrees from the axis, as of an endoscope, show nothing."""
-    rng = np.random.default_rng(2)
-    camera = Camera(Intrinsics(alpha, alpha, 637.0, 481.0), Distortion("k1k2", np.array(k)), (1280, 960))
+def of_an_endoscope(alpha: float, k: list[float], rng: np.random.Generator) -> Calibration:
+    """A camera whose corners are beyond the image of 50 or 30 degrees from the axis, and show nothing."""
+    lens = Distortion("k1k2p1p2", np.array(k))
+    camera = Camera(Intrinsics(alpha, alpha, 637.0, 481.0), lens, (1280, 960))
     board = np.array([(25.0 * x - 100, 25.0 * y - 75, 0.0) for y in range(7) for x in range(9)])
     frames = {}
     for name in "abcdefghijkl":
@@ -118,9 +117,21 @@ def test_points_near_the_fold_of_a_true_lens_do_not_make_it_a_pinhole(alpha: flo
         t = np.append(rng.uniform(-130, 130, 2), rng.uniform(220, 400) * alpha / 675.0)
         frames[name] = Pose(rotation_step(turn[None])[0], t)
     seen = SimulatedRig({"cam": camera}, {"cam": Pose(np.eye(3), np.zeros(3))}, board, frames)
-    found = calibrate(seen.points(0.05, rng)["cam"])
+    return calibrate(seen.points(0.05, rng)["cam"])
+
+
+@pytest.mark.parametrize(("alpha", "k"), [(675.0, [-0.32, 0.04]), (1660.0, [-0.71, 0.07])])
+def test_points_near_the_fold_of_a_true_lens_do_not_make_it_a_pinhole(alpha: float, k: list[float]) -> None:
+    found = of_an_endoscope(alpha, [*k, 0.0, 0.0], np.random.default_rng(2))
     assert found.rmse_px < 1.1 * 0.05 * np.sqrt(2)
     assert found.intrinsics.alpha_u == pytest.approx(alpha, abs=5 * found.std["alpha_u"])
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_an_ordinary_lens_is_decentred_even_if_a_fisheye_stands_for_it(seed: int) -> None:
+    found = of_an_endoscope(1660.0, [-0.71, 0.07, -3.4e-4, 1e-4], np.random.default_rng(seed))
+    assert found.distortion_model == "fisheye"
+    assert found.intrinsics.v0 == pytest.approx(481.0, abs=4 * found.std["v0"])  # 5.0 and 5.7 if p1 may be 0
 
 
 def test_a_fisheye_need_not_see_the_corners() -> None:
