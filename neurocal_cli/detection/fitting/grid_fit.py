@@ -56,7 +56,6 @@ from neurocal_cli.detection.fitting.map_fit import (
 )
 from neurocal_cli.detection.fitting.shading import (
     Levels,
-    LocalShading,
     Shading,
     adapted_shading,
     fit_shading,
@@ -317,11 +316,6 @@ def _shading(first: GridFit) -> Shading:
     return adapted_shading(smooth, dark, light, isinstance(first.map.map, WideMap))
 
 
-def is_bent(shading: Shading, at: SmoothMap) -> bool:
-    """Whether the light may change within a square; that before a wide lens follows levels in any case."""
-    return isinstance(shading, LocalShading) and not isinstance(at, WideMap)
-
-
 def _fine_fit(
     grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading, blur: tuple[Array, Array]
 ) -> tuple[BatchFit, PixelNoise]:
@@ -342,7 +336,7 @@ def _fine_fit(
         shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
         fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
-    if is_bent(shading, first.map.map) and isinstance(fit.pixels, EdgePixels):
+    if shading.is_bent and isinstance(fit.pixels, EdgePixels):
         along = fit.pixels.d, fit.pixels.lever * (0.5 * lines.length).astype(np.float32)[:, None]
         fit = with_gradients(fit, along, of_blur=False, bent=True)
     return fit, noise

@@ -58,6 +58,11 @@ class Shading:
     # (2,) [DN^2] variance of single dark and light squares around the polynomials, including that of these
     spread: Array
 
+    @property
+    def is_bent(self) -> bool:
+        """Whether the light may change within a square."""
+        return False
+
     def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
         """Differences of measured dark and light levels from the polynomials [DN]."""
         dark, light = (levels.level - self.levels_at(levels.place)[k] for k, levels in enumerate(both))
@@ -101,6 +106,12 @@ class LocalShading(Shading):
 
     near: tuple[Levels, Levels]  # the dark and the light levels
     terms: int  # 3 for planes; 1 for even levels, as on both sides of the border of a shadow
+    wide: bool  # whether it is before a wide lens, whose vignetting has no borders
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the light may change within a square."""
+        return not self.wide
 
     def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
         """Differences of the levels from what the others nearby predict [DN]."""
@@ -114,6 +125,9 @@ class LocalShading(Shading):
 
     def spread_at(self, place: Array) -> Array:
         """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
+        if self.wide:  # few levels tell it worse than all of them
+            off = zip(self.off_levels(self.near), self.near, strict=True)
+            return np.stack([np.full(len(place), excess_variance(rest, one.variance)) for rest, one in off])
         return np.stack([self._through(one, place)[2] for one in self.near])
 
     def slopes(self, place: Array) -> tuple[Array, Array]:
@@ -227,7 +241,7 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels, wide: bool = F
     if not wide and smooth.spread.max() < (_EVEN * half) ** 2:
         return smooth
     planes, even = (
-        LocalShading(smooth.frame, smooth.dark, smooth.light, smooth.spread, both, k) for k in (3, 1)
+        LocalShading(smooth.frame, smooth.dark, smooth.light, smooth.spread, both, k, wide) for k in (3, 1)
     )
     best, least = smooth, np.inf
     for shading in (planes, even) if wide else (smooth, planes, even):

@@ -47,7 +47,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     response,
     sharp_profile,
 )
-from neurocal_cli.detection.fitting.grid_fit import LEAST_SCALE, STEPS, GridFit, is_bent
+from neurocal_cli.detection.fitting.grid_fit import LEAST_SCALE, STEPS, GridFit
 from neurocal_cli.detection.fitting.initial_fit import is_reliable, without_outlying_pixels
 from neurocal_cli.detection.fitting.map_fit import MapFit
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance
@@ -95,8 +95,7 @@ def fit_grid_vertices(
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
     fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
     fit = without_outlying_pixels(fit, STEPS)
-    bent = is_bent(fitted.shading, at)
-    fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), bent)
+    fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), fitted.shading.is_bent)
     if fitted.shifts.used:
         fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), LEAST_SCALE))
