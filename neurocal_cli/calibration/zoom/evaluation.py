@@ -22,7 +22,7 @@ from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.adjustment.reprojection import predicted_pixels
-from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.calibration.zoom.initialisation import poses_seen
 from neurocal_cli.calibration.zoom.parameter_networks import are_cameras, local_to_outputs, outputs_to_local
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
@@ -36,11 +36,8 @@ from neurocal_cli.calibration.zoom.settings import (
 )
 from neurocal_cli.calibration.zoom.target import on_target
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, NeurocalError
 
 _HIGHEST_DEGREE = 6
@@ -146,18 +143,13 @@ def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Co
     R, t = np.full((V, 3, 3), np.nan), np.full((V, 3), np.nan)
     number = {name: k for k, name in enumerate(points.points.view_names)}
     for s, values in enumerate(local):
-        distortion = Distortion(lens.model, coefficients_of(values, lens.model))
-        camera = Camera(Intrinsics(values[0], values[1], values[2], values[3], theta), distortion)
-        part = points.points.select(points.point_setting == s)
         try:
-            fit = calibrate(
-                part, type=3, intrinsics=camera, distortion="none", outliers="keep", target="given"
-            )
+            poses = poses_seen(points, s, lens.model, values, theta)
         except NeurocalError as error:
             where = describe(points.controls, points.settings[s])
             raise InputError(f"at {where}: {error}") from error
-        for name, view in fit.views.items():
-            R[number[name]], t[number[name]] = view.pose.R, view.pose.t
+        for name, pose in poses.items():
+            R[number[name]], t[number[name]] = pose.R, pose.t
     return Constants(theta, R, t)
 
 

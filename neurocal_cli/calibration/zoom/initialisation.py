@@ -10,6 +10,7 @@ error no richer one lowers.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from typing import cast
@@ -23,19 +24,22 @@ from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
 from neurocal_cli.calibration.calibrate import Lens, calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.zoom.mlfn import Schedule
-from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
+from neurocal_cli.calibration.zoom.parameter_networks import Budget, are_cameras, fit_committee
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
     LensPoints,
     PixelData,
     Tables,
+    coefficients_of,
     describe,
     scaled_controls,
 )
 from neurocal_cli.calibration.zoom.zoom_lens import RejectedSetting
-from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
@@ -74,8 +78,18 @@ class StaticFit:
     theta: Array  # (S,)
     R: Array  # (V, 3, 3) and (V, 3): pose of each view
     t: Array
-    good: NDArray[np.bool_]  # (S,) calibrated; the values elsewhere are those of the nearest good setting
+    good: NDArray[np.bool_]  # (S,) calibrated by themselves
     reasons: dict[int, str]  # of the failures, by setting
+    # (S, L) precisions of `local`, times the variance of the noise [px^2]: 0 where a setting was calibrated,
+    # elsewhere those of what the others predict.
+    precision: Array
+
+    def select(self, keep: NDArray[np.bool_], views: NDArray[np.bool_]) -> StaticFit:
+        """Keep some settings (S,) and their views (V,)."""
+        return StaticFit(
+            self.local[keep], self.theta[keep], self.R[views], self.t[views], self.good[keep],
+            self.reasons, self.precision[keep],
+        )  # fmt: skip
 
 
 @frozen_dataclass(eq=False)
@@ -89,8 +103,13 @@ class CalibratedSettings:
 
     @classmethod
     def of(cls, data: PixelData, static: StaticFit, progress: Progress | None = None) -> CalibratedSettings:
-        """Calibrations of each setting with common constants."""
-        tables = common_tables(data, static.local, first_constants(static, data), progress)
+        """Calibrations of each setting with common constants.
+
+        A setting that cannot be calibrated by itself starts at the camera that the others predict.
+        """
+        if not static.good.all():
+            static = _completed(data, static, progress)
+        tables = common_tables(data, static, progress)
         return cls(data, static, tables)
 
     @property
@@ -117,24 +136,61 @@ class CalibratedSettings:
 
     def without(self, setting: int, progress: Progress | None = None) -> CalibratedSettings:
         """The result without a setting. Only the common constants are found again."""
-        keep = np.arange(self.lens.n_settings) != setting
-        rest, views = self.lens.select(keep), keep[self.lens.view_setting]
-        check_settings(rest.n_settings, len(rest.controls), self.lens.points.source)
-        static = replace(
-            self.static,
-            local=self.static.local[keep],
-            theta=self.static.theta[keep],
-            R=self.static.R[views],
-            t=self.static.t[views],
-            good=self.static.good[keep],
-        )
-        data = replace(self.data, lens=rest)
+        data, static = _some(self.data, self.static, np.arange(self.lens.n_settings) != setting)
+        check_settings(data.lens.n_settings, len(data.lens.controls), self.lens.points.source)
         return replace(CalibratedSettings.of(data, static, progress), rejected=self.rejected)
 
     def with_rejected(self, setting: Array, reason: str) -> CalibratedSettings:
         """The result, which is without a setting (C,), with the reason."""
         rejected = RejectedSetting(tuple(setting.tolist()), reason)
         return replace(self, rejected=(*self.rejected, rejected))
+
+
+def _some(data: PixelData, static: StaticFit, keep: NDArray[np.bool_]) -> tuple[PixelData, StaticFit]:
+    """Some of the settings; keep is (S,)."""
+    return replace(data, lens=data.lens.select(keep)), static.select(keep, keep[data.setting])
+
+
+def _completed(data: PixelData, static: StaticFit, progress: Progress | None) -> StaticFit:
+    """Settings that cannot be calibrated by themselves, as the networks of the others predict them.
+
+    What their points leave open stays there: they are as uncertain as they differ from the nearest of the
+    others, whose own uncertainty is added.
+    """
+    good = static.good
+    known = CalibratedSettings.of(*_some(data, static, good), progress)
+    settings, table, L = data.lens.settings, known.tables, static.local.shape[1]
+    x = scaled_controls(settings, settings.min(axis=0), settings.max(axis=0))
+    members = fit_committee(
+        x[good], data.names, table.local, table.normal.S, known.variance, np.random.default_rng(0),
+        _QUICK_BUDGET, lambda share: None,
+    )  # fmt: skip
+    nearest = ((x[~good, None] - x[good]) ** 2).sum(axis=-1).argmin(axis=1)
+    donor = table.local[nearest]
+    predicted = np.mean([nets.local(x[~good]) for nets in members], axis=0)
+    predicted = np.where(are_cameras(predicted)[:, None], predicted, donor)
+    own = np.diagonal(local_covariance(table.normal, L, known.variance), axis1=1, axis2=2)[nearest]
+    local, precision = static.local.copy(), np.zeros_like(static.local)
+    local[~good], precision[~good] = predicted, known.variance / ((predicted - donor) ** 2 + own)
+    R, t = static.R.copy(), static.t.copy()
+    number = {name: k for k, name in enumerate(data.lens.points.view_names)}
+    theta = table.constants.theta
+    for s in np.flatnonzero(~good).tolist():
+        with suppress(NeurocalError):
+            for name, pose in poses_seen(data.lens, s, data.model, local[s], theta).items():
+                R[number[name]], t[number[name]] = pose.R, pose.t
+    return replace(static, local=local, R=R, t=t, precision=precision)
+
+
+def poses_seen(lens: LensPoints, s: int, model: str, local: Array, theta: float) -> dict[str, Pose]:
+    """Pose of each view of a setting with a known camera (type 3)."""
+    camera = Camera(
+        Intrinsics(local[0], local[1], local[2], local[3], theta),
+        Distortion(model, coefficients_of(local, model)),
+    )
+    points = lens.points.select(lens.point_setting == s)
+    fit = calibrate(points, type=3, intrinsics=camera, distortion="none", outliers="keep", target="given")
+    return {name: view.pose for name, view in fit.views.items()}
 
 
 def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
@@ -236,7 +292,11 @@ def free_pose_variance(start: CalibratedSettings) -> float:
     if not start.data.still or not start.static.good.all():
         return np.nan
     t_z = start.data.names.index("t_z")
-    static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
+    static = replace(
+        start.static,
+        local=np.delete(start.static.local, t_z, axis=1),
+        precision=np.delete(start.static.precision, t_z, axis=1),
+    )
     free = CalibratedSettings.of(replace(start.data, still=False), static)
     sensible = free.tables.sensible and np.isfinite(free.variance)
     return free.variance if sensible else np.nan
@@ -272,16 +332,7 @@ def calibrate_each(data: PixelData, seed: int, progress: Progress) -> StaticFit:
             f"{int((~good).sum())} of {S} settings cannot be calibrated, the first at "
             f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
         )
-    # Of each setting: itself, or the nearest one that was calibrated.
-    x = lens.settings / np.maximum(np.ptp(lens.settings, axis=0), 1e-300)
-    distance = ((x[:, None] - x[None]) ** 2).sum(axis=-1)
-    distance[:, ~good] = np.inf
-    nearest = np.where(good, np.arange(S), distance.argmin(axis=1))
-    for v, s in enumerate(lens.view_setting):
-        if not good[s]:
-            donor = int(np.flatnonzero(lens.view_setting == nearest[s])[0])
-            R[v], t[v] = R[donor], t[donor]
-    return StaticFit(local[nearest], theta[nearest], R, t, good, reasons)
+    return StaticFit(local, theta, R, t, good, reasons, np.zeros_like(local))
 
 
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
@@ -310,13 +361,18 @@ def first_constants(fit: StaticFit, data: PixelData) -> Constants:
 
 def common_tables(
     data: PixelData,
-    local: Array,
-    constants: Constants,
+    static: StaticFit,
     progress: Progress | None = None,
     *,
+    local: Array | None = None,
     fixed: bool = False,
 ) -> Tables:
-    """Minimise the reprojection error over the local parameters and, if they are not fixed, the constants."""
+    """Minimise the reprojection error over the local parameters and, if they are not fixed, the constants.
+
+    What `static` knows of settings that cannot be calibrated by themselves counts, too. The local parameters
+    start there or at others.
+    """
+    local, constants = static.local if local is None else local, first_constants(static, data)
     tried = count()
 
     def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:
@@ -328,8 +384,17 @@ def common_tables(
         return tables, tables.sensible
 
     L, start = local.shape[1], data.linearise(local, constants)
-    shared = np.arange(L, L + (0 if fixed else data.n_shared))
-    problem = SharedAndOwn(start, lambda at: Arrowhead.of(at.normal.blocks, shared, np.arange(L)), moved)
+    own, shared = np.arange(L), np.arange(L, L + (0 if fixed else data.n_shared))
+
+    def with_known(at: Tables) -> Arrowhead:
+        blocks, P, d = at.normal.blocks, static.precision, static.local - at.local
+        blocks[:, own, own] += P
+        blocks[:, own, -1] += P * d
+        blocks[:, -1, own] += P * d
+        blocks[:, -1, -1] += (P * d * d).sum(axis=1)
+        return Arrowhead.of(blocks, shared, own)
+
+    problem = SharedAndOwn(start, with_known, moved)
     settled = minimise(problem, _OPTIONS).settled[0]
     return replace(problem.state, converged=bool(settled))
 

@@ -39,7 +39,6 @@ from neurocal_cli.calibration.zoom.initialisation import (
     CalibratedSettings,
     FitOptions,
     common_tables,
-    first_constants,
     free_pose_variance,
 )
 from neurocal_cli.calibration.zoom.mlfn import updated_precision
@@ -214,8 +213,7 @@ def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> 
 def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
     """The lens without its errors and warnings."""
     still = start.data.still
-    constants = first_constants(start.static, start.data)
-    averaged = common_tables(start.data, start.tables.local, constants, fixed=True)
+    averaged = common_tables(start.data, start.static, local=start.tables.local, fixed=True)
 
     def of_lens(constants: Constants) -> Constants:
         # The poses of the views of a moving camera are not part of the lens.
@@ -331,7 +329,7 @@ def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Arr
     own = variance * inverse(H) + np.diag(scatter)
     expected = np.asarray(spread_out + own)
     normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
-    squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
+    squares = normal.at(np.pad(out[..., 0], ((0, 0), (0, normal.S.shape[1] - L))))
     return np.sqrt(np.maximum(squares, 0.0) / start.data.counts), np.maximum(normalised, 0.0)
 
 
@@ -357,12 +355,20 @@ def contradiction(lens: ZoomLens, start: CalibratedSettings, s: int) -> str | No
         prediction = lens.predict(start.lens.settings[s : s + 1])
     except InputError:  # no valid camera there, because another setting is wrong
         return None
-    L = len(lens.names)
-    H = start.tables.normal.S[s, :L, :L]
-    error = prediction.local[0] - start.tables.local[s]
-    own = lens.variance * np.linalg.pinv(H, hermitian=True)
-    sigmas = float(np.sqrt(error @ np.linalg.solve(prediction.covariance[0, :L, :L] + own, error) / L))
-    pixels = float(np.sqrt(max(error @ H @ error, 0.0) / start.data.counts[s]))
+    local, data = start.tables.local.copy(), start.data
+    local[s] = prediction.local[0]
+    constants = prediction.constants
+    if not data.still:
+        constants = replace(start.tables.constants, theta=constants.theta)
+    normal, L = data.linearise(local, constants).normal, len(lens.names)
+    more = float(normal.cost[s] - start.tables.normal.cost[s])
+    if not np.isfinite(more):
+        return "the other settings predict no camera that sees its points"
+    # Of the parameters, only what the points of the setting determine counts.
+    H, g = normal.S[s, :L, :L], normal.g[s, :L, None]
+    expected = lens.variance * H + H @ prediction.covariance[0, :L, :L] @ H
+    sigmas = float(np.sqrt((g * solve_scaled(expected, g, ROUNDING)).sum() / L))
+    pixels = float(np.sqrt(max(more, 0.0) / data.counts[s]))
     if sigmas < _SIGMAS or pixels < _LEAST_ERROR * lens.noise_floor_px:
         return None
     return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -260,12 +260,32 @@ def test_a_lens_of_a_moving_board() -> None:
     assert np.isfinite(evaluation.baselines["spline_joint"])
 
 
-def zooming(k: Callable[[float], list[float]]) -> tuple[LensPoints, dict[float, float]]:
-    """Five views of a board at each of twelve zooms, and the true u0; k1, k2, p1 and p2 follow the zoom."""
-    rng = np.random.default_rng(5)
+@pytest.mark.parametrize(("views", "seed"), [((4, 4, 1, 4), 0), ((4, 4, 1, 4), 2), ((4, 1, 4, 4, 1, 4), 4)])
+def test_a_setting_with_one_view_is_never_left_out(views: tuple[int, ...], seed: int) -> None:
+    """One view of a flat board does not determine a camera, so the setting rests on the others."""
+    points, centres = zooming(
+        lambda z: [-0.12 + 0.2 * (z - 24) / 46, 0.0, 0.0, 0.0],
+        views,
+        seed,
+    )
+    lens = fit_lens(points, distortion="k1", skew=False, target="given", topologies=((0, 0),))
+    assert not lens.rejected
+    assert lens.converged
+    assert lens.rmse_px < 1.05 * 0.09 * np.sqrt(2)
+    assert lens.noise_floor_px < 1.1 * 0.09 * np.sqrt(2)
+    prediction = lens.predict([[z] for z in centres])
+    away = (prediction.local[:, 0] - [41.7 * z for z in centres]) / prediction.std[:, 0]
+    assert np.abs(away).max() < 4
+
+
+def zooming(
+    k: Callable[[float], list[float]], views: Sequence[int] = (5,) * 12, seed: int = 5
+) -> tuple[LensPoints, dict[float, float]]:
+    """Some views of a board at each zoom, and the true u0; k1, k2, p1 and p2 follow the zoom."""
+    rng = np.random.default_rng(seed)
     board = np.array([(60.0 * x, 60.0 * y, 0.0) for y in range(8) for x in range(11)])
     worlds, pixels, names, zoom, centres = [], [], [], [], {}
-    for z in np.repeat(np.linspace(24.0, 70.0, 12), 5).tolist():
+    for z in np.repeat(np.linspace(24.0, 70.0, len(views)), views).tolist():
         alpha, centres[z] = 41.7 * z, 750 + 6 * np.sin((z - 24) / 20)
         A = Intrinsics(alpha, alpha, centres[z], 500 - 4 * np.cos((z - 24) / 25))
         R = rotation_step(rng.uniform(-0.6, 0.6, (1, 3)))[0]

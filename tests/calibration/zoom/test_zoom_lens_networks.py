@@ -13,7 +13,6 @@ from support.zoom_laws import HIGH, LOW, grid, seen, truth
 from neurocal_cli.calibration.zoom.initialisation import (
     calibrate_each,
     common_tables,
-    first_constants,
     local_covariance,
 )
 from neurocal_cli.calibration.zoom.joint_training import JointLearner, is_inside, take_turns, train_joint
@@ -274,7 +273,7 @@ def moving() -> tuple[LensPoints, PixelData]:
 
 def begun(lens: LensPoints, data: PixelData) -> tuple[Array, Constants]:
     static = calibrate_each(data, 0, lambda stage, share: None)
-    tables = common_tables(data, static.local, first_constants(static, data))
+    tables = common_tables(data, static)
     rng = np.random.default_rng(5)
     return tables.local * (1 + 1e-4 * rng.normal(size=tables.local.shape)), tables.constants
 
@@ -359,7 +358,7 @@ def test_scatter_enters_the_normal_matrices_as_an_offset_that_is_fitted() -> Non
 def test_tables_reach_the_truth_within_their_covariance() -> None:
     lens, data = still()
     static = calibrate_each(data, 0, lambda stage, share: None)
-    tables = common_tables(data, static.local, first_constants(static, data))
+    tables = common_tables(data, static)
     assert tables.converged
     variance = tables.normal.cost.sum() / (2 * len(lens.points) - 12 * 5 - 6)
     assert np.sqrt(variance) == pytest.approx(0.15, rel=0.1)
@@ -374,7 +373,7 @@ def test_tables_reach_the_truth_within_their_covariance() -> None:
 def test_alternating_ends_where_joint_training_ends() -> None:
     lens, data = still()
     static = calibrate_each(data, 0, lambda stage, share: None)
-    tables = common_tables(data, static.local, first_constants(static, data))
+    tables = common_tables(data, static)
     x = scaled_controls(lens.settings, lens.settings.min(axis=0), lens.settings.max(axis=0))
     budget = Budget(topologies=((1, 1),), starts=4, best=2, members=1, schedule=Schedule(150, 30, 80))
     rng = np.random.default_rng(0)
