@@ -194,16 +194,23 @@ def poses_seen(lens: LensPoints, s: int, model: str, local: Array, theta: float)
 
 
 def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
-    """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
+    """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one.
+
+    To be compared, a richer model starts at the tables of the simpler one; the chosen one starts anew.
+    """
     best: CalibratedSettings | None = None
     failure: DegenerateGeometryError | None = None
     known: dict[tuple[float, ...], float] = {}  # computed when a richer model is compared
+    simpler: CalibratedSettings | None = None
     for model in POLYNOMIAL_MODELS:
+        data = PixelData(lens, options.still, model, options.free_theta)
         try:
-            start = calibrate_settings(lens, model, options)
+            all_settings = _calibrated(data, options, simpler)
+            start = without_wrong(all_settings, options)
         except DegenerateGeometryError as error:
             failure = error
             continue
+        simpler = all_settings
         if best is None:
             best = start
             continue
@@ -223,7 +230,23 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     if best is None:
         assert failure is not None
         raise failure
-    return best
+    return calibrate_settings(lens, best.data.model, options)
+
+
+def _calibrated(
+    data: PixelData, options: FitOptions, simpler: CalibratedSettings | None = None
+) -> CalibratedSettings:
+    """All settings, from random weights or from the tables of a simpler distortion model."""
+    if simpler is None:
+        static = calibrate_each(data, options.seed, options.report)
+    else:
+        static, local, constants = simpler.static, simpler.tables.local, simpler.tables.constants
+        R, t = np.broadcast_to(constants.R, static.R.shape), constants.t
+        if data.still:
+            t = np.column_stack([np.tile(t, (len(R), 1)), local[data.setting, 4]])
+        new = ((0, 0), (0, len(data.names) - local.shape[1]))
+        static = replace(static, local=np.pad(local, new), precision=np.pad(static.precision, new), R=R, t=t)
+    return CalibratedSettings.of(data, static, options.report)
 
 
 def _predicts_better(errors: dict[tuple[float, ...], float], others: dict[tuple[float, ...], float]) -> bool:
@@ -257,12 +280,16 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> dict[tuple[floa
 def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
     """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
     data = PixelData(lens, options.still, model, options.free_theta)
-    start = CalibratedSettings.of(data, calibrate_each(data, options.seed, options.report), options.report)
+    return without_wrong(_calibrated(data, options), options)
+
+
+def without_wrong(start: CalibratedSettings, options: FitOptions) -> CalibratedSettings:
+    """Reject settings whose pixels do not fit."""
     while True:
         normal = start.tables.normal
         if not start.tables.sensible or not np.isfinite(normal.cost).all():
             raise DegenerateGeometryError(
-                f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
+                f"{start.lens.points.source}: no common pose fits all settings; if the camera or the target "
                 "moved, give several views of the board at each setting, and --camera moving"
             )
         rms = np.sqrt(normal.cost / start.data.counts)

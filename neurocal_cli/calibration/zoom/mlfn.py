@@ -212,8 +212,8 @@ def train(
 ) -> TrainedNets:
     """Train a stack of networks, all at once, from initial weights (B, P).
 
-    The controls x (n, D) are scaled to about [-1, 1], the targets (n,) centred and scaled to a spread of
-    about 1. Their variances (n,) are 0 where unknown, so that the scatter is the noise.
+    The controls x (n, D) are scaled to about [-1, 1], the targets (n,) or (B, n) centred and scaled to a
+    spread of about 1. Their variances, likewise, are 0 where unknown, so that the scatter is the noise.
     """
     learner = _NetworkStack(topology, x, targets, variance, weights)
     schedule = schedule or Schedule()
@@ -292,8 +292,9 @@ class _NetworkStack:
         total = self.variance + self.tau2[:, None]
         ratio = ((self.y - self.targets) ** 2 / total).sum(axis=1) / freedom
         known = self.variance.any()
-        least = 1e-4 * float(np.median(self.variance)) if known else 1e-8
-        seed = np.where(self.tau2 > 0, self.tau2, np.median(self.variance) * np.maximum(ratio - 1, 0))
+        median = np.median(self.variance, axis=-1)
+        least = 1e-4 * median if known else 1e-8
+        seed = np.where(self.tau2 > 0, self.tau2, median * np.maximum(ratio - 1, 0))
         self.tau2 = seed * np.clip(ratio, 0.1, 10.0)
         self.tau2 = np.where(self.tau2 < least, 0.0 if known else least, self.tau2)
 

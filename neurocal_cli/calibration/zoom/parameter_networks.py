@@ -29,7 +29,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import field, replace
+from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,24 +246,36 @@ def fit_committee(
     probe = np.array(list(product(np.linspace(-1, 1, _GRID), repeat=x.shape[1])))
     L = len(names)
     first = [j for j, name in enumerate(names) if name == "t_z"]
-    order = [*first, 2, 3, *range(4 + len(first), L), 0, 1]
+    rest = [2, 3, *range(4 + len(first), L)]
     values, held = local.copy(), np.zeros(L, dtype=bool)
     chosen: dict[int, list[ParameterNet]] = {}
-    scale = "log"
-    for count, j in enumerate(order):
-        report(count / L)
+
+    def choose(columns: list[int], found: list[tuple[list[ParameterNet], float]]) -> None:
+        for j, (nets, _) in zip(columns, found, strict=True):
+            chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
+
+    def one(j: int) -> _Targets:
+        return _Targets(values[:, j], spread[:, j])
+
+    if first:
         values, spread = _given(local, values, H, variance, held)
-        targets, derivative = values[:, j], np.ones(len(x))
-        if j == 0:
-            scale, nets = _best_scale(x, values[:, 0], spread[:, 0], rng, budget)
-        else:
-            if j == 1:
-                targets, derivative = np.log(values[:, 1] / values[:, 0]), 1 / values[:, 1]
-            nets, _ = _fit(x, targets, spread[:, j] * derivative**2, rng, budget)
-        chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
-        if names[j] == "t_z":
-            values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
-            held[j] = True
+        choose(first, _fit(x, [one(j) for j in first], rng, budget, lambda share: report(0.3 * share)))
+        values[:, first[0]] = np.mean([net.output(x) for net in chosen[first[0]]], axis=0)
+        held[first] = True
+    values, spread = _given(local, values, H, variance, held)
+    scales = []
+    for scale in SCALES:
+        of_alpha, derivative = to_scale(scale, values[:, 0])
+        scales.append(_Targets(of_alpha, spread[:, 0] * derivative**2, derivative))
+    ratio = _Targets(np.log(values[:, 1] / values[:, 0]), spread[:, 1] / values[:, 1] ** 2)
+    start = 0.3 if first else 0.0
+    found = _fit(
+        x, [*map(one, rest), *scales, ratio], rng, budget, lambda share: report(start + (1 - start) * share)
+    )
+    fits = dict(zip(SCALES, found[len(rest) : -1], strict=True))
+    best = max(fits, key=lambda name: fits[name][1])
+    scale = best if fits[best][1] > fits["log"][1] + _LOG_ODDS else "log"
+    choose([*rest, 0, 1], [*found[: len(rest)], fits[scale], found[-1]])
     return tuple(LensNets(scale, tuple(chosen[j][k] for j in range(L))) for k in range(budget.members))
 
 
@@ -281,53 +295,69 @@ def _given(
     return values, spread
 
 
-def _best_scale(
-    x: Array, alpha: Array, variance: Array, rng: np.random.Generator, budget: Budget
-) -> tuple[str, list[ParameterNet]]:
-    """The scale of alpha_u with the highest evidence, and its networks."""
-    fits = {}
-    for scale in SCALES:
-        targets, derivative = to_scale(scale, alpha)
-        nets, evidence = _fit(x, targets, variance * derivative**2, rng, budget, by_optics=True)
-        # The density of the targets as one of alpha.
-        fits[scale] = (evidence + float(np.log(np.abs(derivative)).sum()), nets)
-    best = max(fits, key=lambda name: fits[name][0])
-    scale = best if fits[best][0] > fits["log"][0] + _LOG_ODDS else "log"
-    return scale, fits[scale][1]
+@frozen_dataclass(eq=False)
+class _Targets:
+    """What a network learns."""
+
+    values: Array  # (S,)
+    variance: Array  # (S,)
+    # (S,) of a focal length on one of `SCALES`: derivatives by the length itself.
+    derivative: Array | None = None
+
+    @cached_property
+    def scaling(self) -> tuple[float, float]:
+        """Centre and spread."""
+        centre, spread = float(self.values.mean()), float(self.values.std())
+        # Equal targets have no spread; their noise, or 1, replaces it.
+        return centre, max(spread, float(np.sqrt(self.variance.mean())), 1e-9 * abs(centre)) or 1.0
 
 
 def _fit(
     x: Array,
-    targets: Array,
-    variance: Array,
+    targets: list[_Targets],
     rng: np.random.Generator,
     budget: Budget,
-    by_optics: bool = False,
-) -> tuple[list[ParameterNet], float]:
-    """Networks of all topologies and starts, best first; the evidence of the best in units of the targets.
+    report: Callable[[float], None],
+) -> list[tuple[list[ParameterNet], float]]:
+    """Networks of all topologies and starts, best first, and the evidence of the best; for each target.
 
-    Focal lengths follow homographic laws (`mlfn`), so they need no tanh units unless these are decidedly more
-    probable; of known cameras, whose errors are estimated from wiggles, all networks are taken.
+    The evidence is in units of the targets, or of the focal length. The networks of all targets are trained
+    together.
     """
-    centre, spread = float(targets.mean()), float(targets.std())
-    # Equal targets have no spread; their noise, or 1, replaces it.
-    spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
-    scaled = (targets - centre) / spread
-    nets, evidence = [], []
-    for own, hidden in budget.topologies or _suitable_topologies(x):
-        topology = suitable_topology(x, own, hidden)
-        start = topology.random_weights(budget.starts if own + hidden else 1, rng)
-        trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)
-        for w, a, tau2, e in zip(
-            trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
+    topologies = [suitable_topology(x, *pair) for pair in budget.topologies or _suitable_topologies(x)]
+    starts = [
+        [each.random_weights(budget.starts if each.own + each.hidden else 1, rng) for each in topologies]
+        for _ in targets
+    ]
+    nets, evidence = ([list[Any]() for _ in targets] for _ in range(2))
+    centre, spread = (np.array(part)[:, None] for part in zip(*(one.scaling for one in targets), strict=True))
+    scaled = (np.array([one.values for one in targets]) - centre) / spread
+    variance = np.array([one.variance for one in targets]) / spread**2
+    for k, topology in enumerate(topologies):
+        report(k / len(topologies))
+        stack = np.concatenate([of_target[k] for of_target in starts])
+        of = np.repeat(np.arange(len(targets)), len(stack) // len(targets))
+        trained = train(topology, x, scaled[of], variance[of], stack, budget.schedule)
+        for t, w, a, tau2, e in zip(
+            of, trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
         ):
-            nets.append(ParameterNet(topology, w, a, centre, spread, float(tau2) * spread**2))
-            evidence.append(float(e))
+            c, s = targets[t].scaling
+            nets[t].append(ParameterNet(topology, w, a, c, s, float(tau2) * s**2))
+            evidence[t].append(float(e))
+    return [_ranked(*each) for each in zip(targets, nets, evidence, strict=True)]
+
+
+def _ranked(
+    targets: _Targets, nets: list[ParameterNet], evidence: list[float]
+) -> tuple[list[ParameterNet], float]:
     order = np.argsort(-np.array(evidence), kind="stable")
-    plain = [k for k in order if nets[k].topology.own + nets[k].topology.hidden == 0]
-    if by_optics and variance.any() and plain and evidence[order[0]] < evidence[plain[0]] + _LOG_ODDS:
-        order = np.array(plain)
-    return [nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread))
+    density = -len(targets.values) * float(np.log(targets.scaling[1]))
+    if targets.derivative is not None:
+        density += float(np.log(np.abs(targets.derivative)).sum())
+        plain = [k for k in order if nets[k].topology.own + nets[k].topology.hidden == 0]
+        if targets.variance.any() and plain and evidence[order[0]] < evidence[plain[0]] + _LOG_ODDS:
+            order = np.array(plain)
+    return [nets[k] for k in order], evidence[order[0]] + density
 
 
 def _suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
