@@ -229,7 +229,7 @@ def test_levels_are_fitted_through_hidden_squares() -> None:
     ahead, behind = (shading.at(place + np.array([sign * step, 0])) for sign in (1, -1))
     for k in (0, 1):
         np.testing.assert_allclose(slopes[k][:, 0], (ahead[k] - behind[k]) / (2 * step), atol=1e-8)
-    assert shading.spread.max() < 0.05
+    assert shading.spread_at(place).max() < 0.05
 
 
 def test_levels_in_even_light_are_known_as_if_this_were_known() -> None:

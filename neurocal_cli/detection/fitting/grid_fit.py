@@ -336,7 +336,7 @@ def _fine_fit(
         shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
         fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
-    if shading.is_bent and isinstance(fit.pixels, EdgePixels):
+    if shading.has_borders and isinstance(fit.pixels, EdgePixels):
         along = fit.pixels.d, fit.pixels.lever * (0.5 * lines.length).astype(np.float32)[:, None]
         fit = with_gradients(fit, along, of_blur=False, bent=True)
     return fit, noise

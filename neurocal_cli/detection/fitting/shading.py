@@ -49,43 +49,83 @@ class Levels:
 
 
 @frozen_dataclass(eq=False)
-class Shading:
-    """Dark and light level as polynomials of the place, scaled by the frame."""
+class Polynomial:
+    """A level as a polynomial of the place, scaled by the frame."""
 
     frame: Frame
-    dark: Array  # (M,) [DN] coefficients of 1, x, y, x^2, x y, y^2, x^3, ...
-    light: Array  # (M,) [DN] the same
-    # (2,) [DN^2] variance of single dark and light squares around the polynomials, including that of these
-    spread: Array
+    coefficients: Array  # (M,) [DN] of 1, x, y, x^2, x y, y^2
+    spread: float  # [DN^2] variance of single squares around it, including that of itself
+
+    def at(self, place: Array) -> tuple[Array, Array, Array]:
+        """Level (N,), slopes (N, 2) [1/px] and variance (N,) of single levels at places (N, 2)."""
+        count = len(self.coefficients)
+        slopes = [terms @ self.coefficients for terms in _polynomial_slopes(self.frame, place, count)]
+        level = polynomial_terms(self.frame, place, count) @ self.coefficients
+        return level, np.stack(slopes, axis=-1), np.full(len(place), self.spread)
+
+    def off(self, levels: Levels) -> Array:
+        """Differences (N,) of levels from it [DN]."""
+        return levels.level - self.at(levels.place)[0]
+
+
+@frozen_dataclass(eq=False)
+class Nearby:
+    """A level that follows nearby levels, with or without slopes, where polynomials do not."""
+
+    frame: Frame
+    levels: Levels
+    terms: int  # 3 for planes; 1 for even levels, as on both sides of the border of a shadow
+    spread: float | None = None  # [DN^2] as of a polynomial; None if it is that of the nearby levels
+
+    def at(self, place: Array, itself: bool = True) -> tuple[Array, Array, Array]:
+        """Level (N,), slopes (N, 2) [1/px] and variance (N,) of single levels at places (N, 2).
+
+        The variance is large at the border of a shadow. A level at a place counts there if `itself`.
+        """
+        levels = self.levels
+        weight = _nearness(levels.place, place, _NEAREST * self.terms, itself) + _FAR
+        near = polynomial_terms(self.frame, levels.place, self.terms)
+        products = (near[:, :, None] * near[:, None]).reshape(len(near), -1)
+        normal = (weight @ products).reshape(len(place), self.terms, self.terms)
+        right = weight @ (near * levels.level[:, None])
+        found = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+        level = (found * polynomial_terms(self.frame, place, self.terms)).sum(axis=1)
+        slopes = np.zeros((len(place), 2))
+        slopes[:, : self.terms - 1] = found[:, 1:] / self.frame.unit
+        rest = weight @ levels.level**2 - (right * found).sum(axis=1)
+        variance = np.maximum(rest, _LEAST_SPREAD * upper_median(levels.variance))
+        return level, slopes, variance if self.spread is None else np.full(len(place), self.spread)
+
+    def off(self, levels: Levels) -> Array:
+        """Differences (N,) of its levels from what the others predict [DN]."""
+        return levels.level - self.at(levels.place, itself=False)[0]
+
+
+@frozen_dataclass(eq=False)
+class Shading:
+    """Dark and light level over the image."""
+
+    frame: Frame
+    dark: Polynomial | Nearby
+    light: Polynomial | Nearby
 
     @property
-    def is_bent(self) -> bool:
-        """Whether the light may change within a square."""
-        return False
-
-    def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
-        """Differences of measured dark and light levels from the polynomials [DN]."""
-        dark, light = (levels.level - self.levels_at(levels.place)[k] for k, levels in enumerate(both))
-        return dark, light
-
-    def levels_at(self, place: Array) -> tuple[Array, Array]:
-        """Dark and light level at places (N, 2)."""
-        terms = polynomial_terms(self.frame, place, len(self.dark))
-        return terms @ self.dark, terms @ self.light
+    def has_borders(self) -> bool:
+        """Whether there may be borders of shadows, beside which the light within a square is bent."""
+        return isinstance(self.dark, Nearby) and self.dark.spread is None
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        dark, light = self.levels_at(place)
+        dark, light = self.dark.at(place)[0], self.light.at(place)[0]
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
     def spread_at(self, place: Array) -> Array:
         """(2, N) variance [DN^2] of single dark and light levels around those at places (N, 2)."""
-        return np.broadcast_to(self.spread[:, None], (2, len(place)))
+        return np.stack([self.dark.at(place)[2], self.light.at(place)[2]])
 
     def slopes(self, place: Array) -> tuple[Array, Array]:
         """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
-        du, dv = _polynomial_slopes(self.frame, place, len(self.dark))
-        dark, light = (np.stack([du @ c, dv @ c], axis=-1) for c in (self.dark, self.light))
+        dark, light = self.dark.at(place)[1], self.light.at(place)[1]
         return 0.5 * (light + dark), 0.5 * (light - dark)
 
     def off(self, place: Array, u: Single, v: Single, value: Single) -> tuple[Single, Single]:
@@ -98,56 +138,6 @@ class Shading:
         by_contrast /= self.at(place)[1].astype(np.float32)[:, None]
         gain = 1 + u * by_contrast[:, :1] + v * by_contrast[:, 1:]
         return value - u * by_mean[:, :1] - v * by_mean[:, 1:], gain
-
-
-@frozen_dataclass(eq=False)
-class LocalShading(Shading):
-    """Levels that follow nearby levels, with or without slopes, where polynomials do not."""
-
-    near: tuple[Levels, Levels]  # the dark and the light levels
-    terms: int  # 3 for planes; 1 for even levels, as on both sides of the border of a shadow
-    wide: bool  # whether it is before a wide lens, whose vignetting has no borders
-
-    @property
-    def is_bent(self) -> bool:
-        """Whether the light may change within a square."""
-        return not self.wide
-
-    def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
-        """Differences of the levels from what the others nearby predict [DN]."""
-        dark, light = (one.level - self._through(one, one.place, itself=False)[0] for one in both)
-        return dark, light
-
-    def levels_at(self, place: Array) -> tuple[Array, Array]:
-        """Dark and light level at places (N, 2)."""
-        dark, light = (self._through(one, place)[0] for one in self.near)
-        return dark, light
-
-    def spread_at(self, place: Array) -> Array:
-        """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
-        if self.wide:  # few levels tell it worse than all of them
-            off = zip(self.off_levels(self.near), self.near, strict=True)
-            return np.stack([np.full(len(place), excess_variance(rest, one.variance)) for rest, one in off])
-        return np.stack([self._through(one, place)[2] for one in self.near])
-
-    def slopes(self, place: Array) -> tuple[Array, Array]:
-        """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
-        dark, light = (self._through(one, place)[1] for one in self.near)
-        return 0.5 * (light + dark), 0.5 * (light - dark)
-
-    def _through(self, levels: Levels, place: Array, itself: bool = True) -> tuple[Array, Array, Array]:
-        """Level (N,), slopes (N, 2) [1/px] and variance (N,) of single levels at places (N, 2)."""
-        weight = _nearness(levels.place, place, _NEAREST * self.terms, itself) + _FAR
-        near = polynomial_terms(self.frame, levels.place, self.terms)
-        products = (near[:, :, None] * near[:, None]).reshape(len(near), -1)
-        normal = (weight @ products).reshape(len(place), self.terms, self.terms)
-        right = weight @ (near * levels.level[:, None])
-        found = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-        level = (found * polynomial_terms(self.frame, place, self.terms)).sum(axis=1)
-        slopes = np.zeros((len(place), 2))
-        slopes[:, : self.terms - 1] = found[:, 1:] / self.frame.unit
-        rest = weight @ levels.level**2 - (right * found).sum(axis=1)
-        return level, slopes, np.maximum(rest, _LEAST_SPREAD * upper_median(levels.variance))
 
 
 def _nearness(near: Array, place: Array, nearest: int, itself: bool = True) -> Array:
@@ -194,12 +184,11 @@ def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
         first, last = places.min(axis=0), places.max(axis=0)
         centre, unit = 0.5 * (first + last), max(0.5 * float((last - first).max()), 1.0)
         frame = replace(frame, centre=centre, unit=unit)
-    (low, low_spread), (high, high_spread) = (_fit(frame, levels) for levels in (dark, light))
-    return Shading(frame, low, high, np.array([low_spread, high_spread]))
+    return Shading(frame, _fit(frame, dark), _fit(frame, light))
 
 
-def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
-    """Coefficients of a robust polynomial, and the variance of single levels around it [DN^2].
+def _fit(frame: Frame, levels: Levels) -> Polynomial:
+    """A robust polynomial through levels.
 
     Each degree counts as far as it explains more than chance does. Else, the terms that even light does not
     need would make the levels of a board of few edges uncertain.
@@ -207,7 +196,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     n = len(levels.level)
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
-        return coefficients, np.inf
+        return Polynomial(frame, coefficients, np.inf)
     terms = polynomial_terms(frame, levels.place, _TERMS[-1])
     residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
@@ -224,7 +213,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
         coefficients += share * (found - before)
         count += share * (used - fewer)
         before = found
-    return coefficients, spread + count / n * upper_median(levels.variance)
+    return Polynomial(frame, coefficients, spread + count / n * upper_median(levels.variance))
 
 
 def adapted_shading(smooth: Shading, dark: Levels, light: Levels, wide: bool = False) -> Shading:
@@ -238,17 +227,20 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels, wide: bool = F
     if min(len(levels.level) for levels in both) <= _FEWEST:
         return smooth
     half = upper_median(smooth.at(light.place)[1])
-    if not wide and smooth.spread.max() < (_EVEN * half) ** 2:
+    if not wide and smooth.spread_at(light.place[:1]).max() < (_EVEN * half) ** 2:
         return smooth
-    planes, even = (
-        LocalShading(smooth.frame, smooth.dark, smooth.light, smooth.spread, both, k, wide) for k in (3, 1)
-    )
-    best, least = smooth, np.inf
-    for shading in (planes, even) if wide else (smooth, planes, even):
-        error = float(np.abs(np.concatenate(shading.off_levels(both))).mean())
+    best = given = smooth.dark, smooth.light
+    nearby = [(Nearby(smooth.frame, dark, terms), Nearby(smooth.frame, light, terms)) for terms in (3, 1)]
+    rest, least = list[Array](), np.inf
+    for one in nearby if wide else (given, *nearby):
+        off = [level.off(levels) for level, levels in zip(one, both, strict=True)]
+        error = float(np.abs(np.concatenate(off)).mean())
         if error < _CLEARLY * least:
-            best, least = shading, error
-    return best
+            best, rest, least = one, off, error
+    if wide:  # there are no borders of shadows, and few levels tell the spread worse than all of them
+        spreads = [excess_variance(left, levels.variance) for left, levels in zip(rest, both, strict=True)]
+        best = replace(best[0], spread=spreads[0]), replace(best[1], spread=spreads[1])
+    return Shading(smooth.frame, *best)
 
 
 def _refit(terms: Array, levels: Levels, residual: Array, spread: float) -> tuple[Array, Array, float]:

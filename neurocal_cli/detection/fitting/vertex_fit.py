@@ -95,7 +95,7 @@ def fit_grid_vertices(
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
     fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
     fit = without_outlying_pixels(fit, STEPS)
-    fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), fitted.shading.is_bent)
+    fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), fitted.shading.has_borders)
     if fitted.shifts.used:
         fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), LEAST_SCALE))
