@@ -40,7 +40,7 @@ from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_at_once
 from neurocal_cli.observations.board import Board
 
-_FORMAT = 8  # raised when the same image gives other points than before
+_FORMAT = 9  # raised when the same image gives other points than before
 # Of a detection; its grids are not cached, which only its picture needs.
 _FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings", "notes")
 _WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process

@@ -71,6 +71,16 @@ def test_soft_borders_of_shadows_do_not_displace_points(points: Points) -> None:
 
 
 @pytest.mark.parametrize(
+    ("points", "width"), slow_but((("midpoints", 20.0),), (("midpoints", 20.0), ("vertices", 8.0)))
+)
+def test_points_at_the_border_of_a_shadow_know_their_errors(points: Points, width: float) -> None:
+    found = together(half_in_shadow(0.4, width), points, range(4))
+    assert np.abs(found.normalised).max() < 3.6  # 5.3 and 3.8
+    worst = np.argsort(-np.abs(found.error))[: len(found.error) // 20]
+    assert np.sqrt((found.normalised[worst] ** 2).mean()) < 2.1  # 3.0 and 2.4
+
+
+@pytest.mark.parametrize(
     "effect", [pytest.param(beside_a_lamp(4.0), marks=pytest.mark.slow), half_in_shadow(0.4, 6.0)]
 )
 def test_hidden_edges_are_left_out_in_uneven_light(effect: Effect) -> None:

@@ -33,6 +33,9 @@ _MORE_STEPS = 20  # greatest number, for fits that have not converged with the o
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
 _FLOAT32 = 1e-6  # relative error of float32 sums
 _NOTHING = 1e-9  # information that keeps fits without pixels regular
+# Standard deviations of chi2 beyond which bent light is misfitted, and number of patterns, all alike, that
+# this is spread over.
+_BY_CHANCE, _PATTERNS = 2.0, 30.0
 
 
 @frozen_dataclass(eq=False)
@@ -143,6 +146,7 @@ class BatchFit:
     shape: ProfileShape
     step: Array  # (E,) length of the last step, in standard deviations
     linear: Linearised  # the model at the values
+    bent: bool = False  # whether the light may be bent within a fit, by more than the model has
 
     @cached_property
     def covariance(self) -> Array:
@@ -167,8 +171,16 @@ class BatchFit:
 
     @property
     def variance_growth(self) -> Array:
-        """(E,) factor on variances; above 1 for fits whose last step exceeded a standard deviation."""
-        return np.where(self.step > 1, 1 + self.step**2, 1.0)
+        """(E,) factor on variances of fits of the noise 1.
+
+        It is above 1 if the last step exceeded a standard deviation, or if bent light is misfitted by more
+        than chance: this displaces a fit as much as it leaves in any other pattern.
+        """
+        growth = np.where(self.step > 1, 1 + self.step**2, 1.0)
+        if self.bent:
+            left = self.chi2 - self.count - _BY_CHANCE * np.sqrt(2 * self.count)
+            growth += np.maximum(left, 0) / _PATTERNS
+        return growth
 
     def scaled(self, noise: float) -> BatchFit:
         """Rescale the fits to a pixel variance that is larger by a factor."""

@@ -211,6 +211,7 @@ def with_gradients(fit: BatchFit, along: tuple[Single, Single], of_blur: bool, b
         elif (spread := excess_variance(found[:, kind].ravel(), own.ravel())) > _NOTABLE * upper_median(own):
             believed[:, kind] = spread
     used = np.flatnonzero(believed.any(axis=0))
+    fit = replace(fit, bent=bent)
     if not len(used):
         return fit
     prior = np.eye(len(used)) / np.maximum(believed[:, used, None], _NO_GRADIENT)
