@@ -35,6 +35,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
     fit_batch,
     rows_for,
 )
+from neurocal_cli.detection.fitting.common_parameters import board_shading, with_gradients
 from neurocal_cli.detection.fitting.edge_profile import (
     RESPONSE_TERMS,
     EdgeProfile,
@@ -45,7 +46,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
 from neurocal_cli.detection.fitting.grid_fit import map_of_vertices, wide_if_needed
 from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
-from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
+from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
 from neurocal_cli.detection.fitting.strips import ANCHOR, GridImage, Single, packed
 from neurocal_cli.detection.grey import eight_bits, least_variance
@@ -75,6 +76,8 @@ class CirclePixels(FitPixels):
     u: Single  # normal of the outline
     v: Single
     bend: Single  # [1/px] half of its curvature
+    right: Single  # [px] from the image of the centre
+    down: Single
 
 
 def outline_pixels(
@@ -104,10 +107,10 @@ def outline_pixels(
     )
     value: Single = image[np.where(used, v, 0).astype(int), np.where(used, u, 0).astype(int)]
     gain: Single = np.ones_like(value)
+    off = u - middle[:, :1], v - middle[:, 1:]
+    columns: list[Single] = [np.where(used, x, 0).astype(np.float32) for x in (d, n_u, n_v, bend, *off)]
     if shading is not None:
-        off = ((u - middle[:, :1]).astype(np.float32), (v - middle[:, 1:]).astype(np.float32))
-        value, gain = shading.off(middle, *off, value)
-    columns: list[Single] = [np.where(used, x, 0).astype(np.float32) for x in (d, n_u, n_v, bend)]
+        value, gain = shading.off(middle, columns[-2], columns[-1], value)
     return CirclePixels(value, gain, np.ones_like(value), used.astype(np.float32), *columns)
 
 
@@ -203,7 +206,7 @@ def measure_circles(
     for done in range(1, _MOST_ROUNDS + 1):
         band = _band(light, found.map, places, radius, _ROOM * apart)
         pixels = outline_pixels(light, found.map, places, radius, blur, band, shading)
-        fit = _fitted(pixels, blur, floor)
+        fit = _fitted(pixels, blur, floor, shading is not None and shading.has_borders)
         sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
         if sharpening is not None:
             undone = sharpening.undone(light, raw.pixels, 2 * _pixel_radius(found.map, places, radius))
@@ -221,7 +224,7 @@ def measure_circles(
             break
         blur = upper_median(fit.values[some, BLUR])
         radius *= 1 + upper_median(fit.values[some, 2]) / _pixel_radius(found.map, places, radius)
-        shading = _shading(found.map, places, fit, some)
+        shading = board_shading(fit, found.map.at(places), some, found.map)
         if done >= _ROUNDS and moved < _SETTLED * np.sqrt(upper_median(fit.covariance[some, 0, 0])):
             break
     uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
@@ -296,8 +299,8 @@ def _pixel_radius(at: SmoothMap, places: Array, radius: float) -> float:
     return radius * upper_median(np.sqrt(np.abs(np.linalg.det(_steps(at, places)))))
 
 
-def _fitted(pixels: CirclePixels, blur: float, floor: float) -> BatchFit:
-    """Fit all circles: shift (2,), growth, levels and blur."""
+def _fitted(pixels: CirclePixels, blur: float, floor: float, borders: bool) -> BatchFit:
+    """Fit all circles: shift (2,), growth, levels and blur; the light may have `borders` of shadows."""
     used = pixels.root > 0
     dark, light = (_mean(pixels.value, used & (sign * pixels.d > 0.5 * blur)) for sign in (-1, 1))
     usual = [upper_median(one[np.isfinite(one)]) if np.isfinite(one).any() else 0.0 for one in (dark, light)]
@@ -311,9 +314,15 @@ def _fitted(pixels: CirclePixels, blur: float, floor: float) -> BatchFit:
     shape = ProfileShape(np.zeros((len(mean), 2)), np.zeros(RESPONSE_TERMS))
     start = np.concatenate([np.zeros((len(mean), 3)), prior_mean], axis=1)
     noise = max(floor, (0.02 * upper_median(contrast)) ** 2)
-    unit = replace(pixels, root=pixels.root / np.float32(np.sqrt(noise)))
-    fit = fit_batch(circle_model, unit, start, prior, shape, _STEPS)
-    return fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor / noise))
+    weight = np.full_like(pixels.root, 1 / noise)
+    fit = fit_batch(circle_model, pixels.weighed(weight), start, prior, shape, _STEPS)
+    scale = max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor / noise)
+    fit = fit.continued(shape, _STEPS, weight=weight / np.float32(scale))
+    along = pixels.right, pixels.down
+    found = with_gradients(fit, along, of_blur=False, bent=False)
+    if borders or found.values is not fit.values:  # where the light has other gradients, it is bent as well
+        found = with_gradients(fit, along, of_blur=False, bent=True)
+    return found.scaled(max(upper_median(found.chi2_per_pixel), _LEAST_SCALE * floor / (noise * scale)))
 
 
 def _profile(pixels: CirclePixels, fit: BatchFit) -> EdgeProfile | None:
@@ -368,15 +377,6 @@ def _mapped(
     )
     departure = np.abs(mapped.residual) / np.sqrt(expected * mapped.excess)
     return mapped, departure.reshape(2, n).max(axis=0)
-
-
-def _shading(at: SmoothMap, places: Array, fit: BatchFit, good: NDArray[np.bool_]) -> Shading:
-    """Levels over the image by those of the circles."""
-    place = at.at(places[good])
-    mean, contrast = fit.values[good, 3], fit.values[good, 4]
-    variance = fit.covariance[good, 3, 3] + fit.covariance[good, 4, 4]
-    dark, light = (Levels(place, mean + sign * contrast, variance) for sign in (-1, 1))
-    return fit_shading(at.frame, dark, light)
 
 
 def locate_circles(board: Board, image: NDArray[np.generic]) -> Identified:

@@ -42,7 +42,14 @@ from neurocal_cli.detection.fitting.edge_profile import (
     tail_terms,
 )
 from neurocal_cli.detection.fitting.map_fit import MapFit, WideMap
-from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
+from neurocal_cli.detection.fitting.shading import (
+    Levels,
+    Shading,
+    adapted_shading,
+    excess_variance,
+    fit_shading,
+    polynomial_terms,
+)
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single
 from neurocal_cli.detection.medians import upper_median
@@ -233,6 +240,16 @@ def board_blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothM
         if wide or field.relative * board.usual**2 < _CLEARLY_LESS * board.spread:
             return field
     return board
+
+
+def board_shading(fit: BatchFit, place: Array, good: NDArray[np.bool_], at: SmoothMap) -> Shading:
+    """Estimate the shading of the board from the levels of the good fits at places (E, 2) [px]."""
+    covariance, (mean, contrast) = fit.covariance[good], fit.values[good, MEAN:BLUR].T
+    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
+    cross = 2 * covariance[:, MEAN, CONTRAST]
+    dark = Levels(place[good], mean - contrast, both - cross)
+    light = Levels(place[good], mean + contrast, both + cross)
+    return adapted_shading(fit_shading(at.frame, dark, light), dark, light, isinstance(at, WideMap))
 
 
 @frozen_dataclass(eq=False)

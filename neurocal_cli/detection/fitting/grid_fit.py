@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape, fit_batch
+from neurocal_cli.detection.fitting.batched_newton import BatchFit, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     EdgeShifts,
     FieldBlur,
     PixelNoise,
     board_blur,
+    board_shading,
     level_prior,
     profile_shape,
     with_gradients,
@@ -54,13 +55,7 @@ from neurocal_cli.detection.fitting.map_fit import (
     select_map,
     wide_start,
 )
-from neurocal_cli.detection.fitting.shading import (
-    Levels,
-    Shading,
-    adapted_shading,
-    fit_shading,
-    square_levels,
-)
+from neurocal_cli.detection.fitting.shading import Shading, adapted_shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import ANCHOR, FOUND, GridEdges, GridImage, Lines, strip_pixels
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
@@ -280,7 +275,7 @@ def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
     """Fit edges with the common parameters of a fit, and the map through them."""
     good, n = first.good, len(first.good)
     lines = grid_image.edges.lines(first.map.map)
-    shading = _shading(first)
+    shading = board_shading(first.fit, first.lines.middle, good, first.map.map)
     blur = first.blur
     fit, noise = _fine_fit(grid_image, first, lines, shading, blur.at(lines))
     scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, LEAST_SCALE)
@@ -302,18 +297,6 @@ def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
     possible = np.abs(shifts.terms(lines) @ mapped.shift) < 0.5 * lines.width
     good = is_reliable(fit, np.where(possible, departure, np.inf))
     return GridFit(grid_image, lines, fit, mapped, shifts, shading, noise, good)
-
-
-def _shading(first: GridFit) -> Shading:
-    """Estimate the shading of the whole board from the levels of its edges."""
-    covariance, values, good = first.fit.covariance, first.fit.values, first.good
-    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
-    cross = 2 * covariance[:, MEAN, CONTRAST]
-    place = first.lines.middle[good]
-    dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
-    light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
-    smooth = fit_shading(first.map.map.frame, dark, light)
-    return adapted_shading(smooth, dark, light, isinstance(first.map.map, WideMap))
 
 
 def _fine_fit(
