@@ -88,13 +88,12 @@ def measure(
     whose fits are rejected are left out.
     """
     light = image if gamma is None else linearised(image, gamma)
-    floor = least_variance(light)
-    grid_image = GridImage(light, grid, floor)
+    grid_image = GridImage(light, grid, least_variance(light))
     vertices = np.full(grid.pixels.shape, np.nan)
     if len(grid_image.edges.index) == 0:
         index = np.zeros((0, 2), dtype=np.int64)
         return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
-    fitted = fit_grid(grid_image) if ink is None else fit_with_ink(light, grid, floor, ink)
+    fitted = fit_grid(grid_image) if ink is None else fit_with_ink(grid_image, ink)
     grid_image = fitted.grid_image
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":

@@ -141,6 +141,13 @@ def _errors(lenses: Array, grid: Array, pixels: Array) -> tuple[Array, Array]:
     return matrix, np.where((ahead > 0).all(axis=1)[:, None], error, np.inf)
 
 
+def frame_along(axis: Array) -> Array:
+    """A rotation (3, 3) of a unit vector (3,) to the z axis, which is regular for all of them."""
+    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    aside /= np.linalg.norm(aside)
+    return np.stack([np.cross(aside, axis), aside, axis])
+
+
 @frozen_dataclass(eq=False)
 class Flattening:
     """A map that flattens the image of a board, so that homographies describe it although a lens bends it.
@@ -160,10 +167,7 @@ class Flattening:
         fit = fit_wide_lens(ground, pixels, size)
         if not fit.rms < _CLEARLY * left:
             return cls()
-        axis = fit.lens.directions(pixels.mean(axis=0))
-        aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        aside /= np.linalg.norm(aside)
-        return cls(fit.lens, np.stack([np.cross(aside, axis), aside, axis]))
+        return cls(fit.lens, frame_along(fit.lens.directions(pixels.mean(axis=0))))
 
     def flat(self, pixels: Array) -> Array:
         """Points (..., 2) of pixels (..., 2); NaN behind the plane."""

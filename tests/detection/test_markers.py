@@ -24,6 +24,7 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.saddles import grey_levels
 from neurocal_cli.detection.fitting.batched_newton import BLUR
+from neurocal_cli.detection.fitting.strips import GridImage
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
@@ -122,7 +123,7 @@ def test_codes_that_are_blurred_into_the_edges_leave_the_blur_and_the_noise_of_a
     image = taken(scene, 2).image
     (located,) = locate(scene.board, image).located
     assert located.ink is not None
-    fitted = fit_with_ink(image, located.grid, 1 / 12, located.ink)
+    fitted = fit_with_ink(GridImage(image, located.grid, 1 / 12), located.ink)
     assert upper_median(fitted.fit.values[:, BLUR]) == pytest.approx(scene.sigma_t, rel=0.03)
     assert fitted.noise.edge == pytest.approx(scene.sensor.read_noise**2 + 1 / 12, rel=0.3)
 

@@ -209,9 +209,8 @@ def measure_circles(
         fit = _fitted(pixels, blur, floor, shading is not None and shading.has_borders)
         sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
         if sharpening is not None:
-            undone = sharpening.undone(light, raw.pixels, 2 * _pixel_radius(found.map, places, radius))
-            gained = float((sharpening.inverse**2).sum())
-            return measure_circles(undone, plane, circles, floor * gained, undo=False)
+            undone = sharpening.undone(raw, 2 * _pixel_radius(found.map, places, radius))
+            return measure_circles(undone.image, plane, circles, undone.floor, undo=False)
         undo = False
         centre = found.map.at(places) + fit.values[:, :2]
         mapped, departure = _mapped(raw, found, places, centre, fit, some)

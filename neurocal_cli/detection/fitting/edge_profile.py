@@ -41,6 +41,7 @@ them is the reflection of the other.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import cv2
@@ -49,7 +50,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.fitting.strips import Single
+from neurocal_cli.detection.fitting.strips import GridImage, Single
 
 Real = NDArray[np.floating]
 
@@ -305,15 +306,15 @@ class Sharpening:
         part = kernel[middle - half : middle + half + 1, middle - half : middle + half + 1]
         return np.asarray(part / part.sum(), dtype=np.float32)
 
-    def undone(self, image: NDArray[np.generic], points: Array, room: float) -> Single:
-        """Undo it around points (N, 2) in an image, and `room` [px] beyond them."""
-        whole = image.astype(np.float32)
+    def undone(self, seen: GridImage, room: float) -> GridImage:
+        """Undo it around a grid, and `room` [px] beyond its vertices."""
+        whole, points = seen.image.astype(np.float32), seen.pixels
         room += self.inverse.shape[0]
         low = np.maximum(points.min(axis=0) - room, 0).astype(int)
         high = points.max(axis=0).astype(int) + int(room)
         part = np.s_[low[1] : high[1], low[0] : high[0]]
         whole[part] = cv2.filter2D(whole[part], cv2.CV_32F, self.inverse, borderType=cv2.BORDER_REFLECT)
-        return whole
+        return replace(seen, image=whole, floor=seen.floor * float((self.inverse**2).sum()))
 
 
 def find_sharpening(profile: EdgeProfile | None) -> Sharpening | None:

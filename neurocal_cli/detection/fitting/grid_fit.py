@@ -134,10 +134,7 @@ def fit_grid(grid_image: GridImage, undo: bool = True) -> GridFit:
     mapped, sigma, levels, profile = _by_moments(grid_image, found, shading)
     sharpening = find_sharpening(profile) if undo else None
     if sharpening is not None:
-        room = 2 * grid_image.grid.square
-        image = sharpening.undone(grid_image.image, grid_image.pixels, room)
-        floor = grid_image.floor * float((sharpening.inverse**2).sum())
-        return fit_grid(replace(grid_image, image=image, floor=floor), undo=False)
+        return fit_grid(sharpening.undone(grid_image, 2 * grid_image.grid.square), undo=False)
     return fit_from(grid_image, mapped, sigma, shading, levels, noise)
 
 

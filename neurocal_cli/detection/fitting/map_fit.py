@@ -33,7 +33,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.smooth_map import Frame, Places, SmoothMap
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.detection.wide_lens import fit_wide_lens
+from neurocal_cli.detection.wide_lens import fit_wide_lens, frame_along
 
 _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0
@@ -145,10 +145,7 @@ def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) 
     scaled = fit.matrix @ np.array(
         [[frame.half[0], 0, frame.origin[0]], [0, frame.half[1], frame.origin[1]], [0, 0, 1.0]]
     )
-    axis = scaled[:, 2] / np.linalg.norm(scaled[:, 2])
-    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    aside /= np.linalg.norm(aside)
-    turn = np.column_stack([np.cross(aside, axis), aside, axis])
+    turn = frame_along(scaled[:, 2] / np.linalg.norm(scaled[:, 2])).T
     matrix = turn.T @ scaled
     values = np.zeros(_REST)
     values[:_HOMOGRAPHY] = (matrix / matrix[2, 2]).ravel()[:_HOMOGRAPHY]

@@ -12,7 +12,6 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import interpolate
@@ -38,7 +37,6 @@ from neurocal_cli.detection.fitting.shading import (
 )
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Appearance, Ink, with_ink
 from neurocal_cli.detection.medians import upper_median
 
@@ -65,19 +63,16 @@ _TINY = 1e-9  # least variance of the samples of a profile
 _ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
 
 
-def fit_with_ink(
-    image: NDArray[np.generic], grid: Grid, floor: float, ink: Ink, undo: bool = True
-) -> GridFit:
+def fit_with_ink(raw: GridImage, ink: Ink, undo: bool = True) -> GridFit:
     """Fit a board whose cells have patterns, after sharpening by the camera is undone if `undo`."""
-    raw, ink = GridImage(image, grid, floor), ink.beside(grid.seen)
+    ink = ink.beside(raw.grid.seen)
     look, mapped, levels, noise, shading = _first_look(raw, ink)
     sharpening = find_sharpening(_plain_profile(raw, mapped, _gaps(raw, ink), *levels)) if undo else None
     if sharpening is not None:
-        undone = sharpening.undone(image, raw.pixels, 2 * grid.square)
-        return fit_with_ink(undone, grid, floor * float((sharpening.inverse**2).sum()), ink, undo=False)
+        return fit_with_ink(sharpening.undone(raw, 2 * raw.grid.square), ink, undo=False)
     sigma = upper_median(look.blur[:, 0])
     inked = with_ink(raw, ink, look, _FIRST_MOST)
-    fitted = fit_from(inked, mapped, sigma, shading, levels, max(noise, floor))
+    fitted = fit_from(inked, mapped, sigma, shading, levels, max(noise, raw.floor))
     look = _look_of(fitted, ink)
     gap = ink.gap * look.clearance(ink)
     rounds = next((all_of for limit, all_of in _MOST if gap > limit), _MOST_NEAR)
