@@ -28,7 +28,13 @@ from neurocal_cli.detection.fitting.strips import GridImage
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink, _Blurred
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
-from neurocal_cli.detection.markers.lattice import agreement, find_vertices, leave_out_strays, place
+from neurocal_cli.detection.markers.lattice import (
+    agreement,
+    find_vertices,
+    leave_out_strays,
+    place,
+    tell_a_plane,
+)
 from neurocal_cli.detection.markers.locate import locate
 from neurocal_cli.detection.markers.reading import Marks, numbers_in, read_markers
 from neurocal_cli.detection.medians import upper_median
@@ -126,6 +132,19 @@ def test_codes_that_are_blurred_into_the_edges_leave_the_blur_and_the_noise_of_a
     fitted = fit_with_ink(GridImage(image, located.grid, 1 / 12), located.ink)
     assert upper_median(fitted.fit.values[:, BLUR]) == pytest.approx(scene.sigma_t, rel=0.03)
     assert fitted.noise.edge == pytest.approx(scene.sensor.read_noise**2 + 1 / 12, rel=0.3)
+
+
+@pytest.mark.parametrize("along", [(1, 0), (0, 1), (1, 1), (-1, 2)])
+@pytest.mark.parametrize("first", [0, 2, 4])
+def test_vertices_on_a_line_and_one_beside_it_do_not_tell_how_a_board_lies(
+    along: tuple[int, int], first: int
+) -> None:
+    """A diagonal and one vertex gave a singular map, and an internal error."""
+    line = np.arange(4.0)[:, None] * along
+    beside = np.array([[2.0, 5.0], [5.0, 2.0]])
+    assert not tell_a_plane(line)
+    assert not tell_a_plane(np.insert(line, first, beside[0], axis=0))
+    assert tell_a_plane(np.insert(line, [first, first], beside, axis=0))
 
 
 def test_a_grid_without_a_whole_cell_shows_no_codes() -> None:

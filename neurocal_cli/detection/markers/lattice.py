@@ -201,8 +201,7 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
         # Vertices that were too far from the markers may be near the new ones.
         corners, pixels = ground[seen], found[seen]
     seen = np.isfinite(found[..., 0])
-    # Vertices of one line and a single other one do not tell how the board lies.
-    if seen.sum() < _FEWEST or seen.sum() - max(seen.sum(axis=0).max(), seen.sum(axis=1).max()) < 2:
+    if seen.sum() < _FEWEST or not tell_a_plane(ground[seen]):
         return None
     rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     first = int(cols[0]), int(rows[0])
@@ -211,6 +210,16 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     if isinstance(plane, TagPlane):
         part, dark = part[::-1], (dark + len(part)) % 2
     return Grid(np.ascontiguousarray(part), dark), first
+
+
+def tell_a_plane(places: Array) -> bool:
+    """Whether at least four places (N, 2) tell how a board lies: not if all but one are on a line."""
+    # Two of any three are on it.
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        along, away = places[second] - places[first], places - places[first]
+        if np.count_nonzero(np.abs(along[0] * away[:, 1] - along[1] * away[:, 0]) > _SAME) < 2:
+            return False
+    return True
 
 
 def flattening_of(ground: Array, pixels: Array, size: tuple[int, int]) -> Flattening:
