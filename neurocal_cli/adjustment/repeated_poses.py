@@ -3,7 +3,8 @@
 Such views count as one view wherever views are counted. How much independent information they hold is
 measured: if a point has the same residual in all of them, n views are worth no more than one; if the
 residuals are independent, they average out. If rho is the correlation of residuals between repeated views, n
-of them are worth n / (1 + (n - 1) rho) views.
+of them are worth n / (1 + (n - 1) rho) views. Frames whose errors last from one to the next
+(`following_views`) are counted in the same way, by blocks of views.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.following_views import variance_of_following
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -32,29 +34,35 @@ def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
 
 @frozen_dataclass(eq=False)
 class RepeatedPoses:
-    """Groups of views that share a pose."""
+    """Groups of views whose errors are alike: they share a pose, or follow each other."""
 
-    group: NDArray[np.intp]  # (V,) number of each view's pose, from 0 in the order of the views
-    correlation: float  # of a point's residuals between views of one pose, 0 to 1
+    pose: NDArray[np.intp]  # (V,) number of each view's pose, from 0 in the order of the views
+    group: NDArray[np.intp]  # (V,) the same of each view's group: these poses, or blocks of views
+    correlation: float  # of a point's residuals between views of one group, 0 to 1
 
     @property
     def n_poses(self) -> int:
         """Number of different poses."""
+        return int(self.pose.max(initial=-1)) + 1
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
         return int(self.group.max(initial=-1)) + 1
 
     @property
     def none(self) -> bool:
-        """Whether every view has a pose of its own."""
-        return self.n_poses == len(self.group)
+        """Whether every view is a group of its own."""
+        return self.n_groups == len(self.group)
 
     @property
     def size(self) -> NDArray[np.intp]:
-        """(P,) number of views of each pose."""
-        return np.bincount(self.group, minlength=self.n_poses)
+        """(G,) number of views of each group."""
+        return np.bincount(self.group, minlength=self.n_groups)
 
     @property
     def variance(self) -> Array:
-        """(P,) variance of a sum over the views of a pose, relative to that of independent views."""
+        """(G,) variance of a sum over the views of a group, relative to that of independent views."""
         return np.asarray(1.0 + (self.size - 1) * self.correlation)
 
     @property
@@ -63,12 +71,12 @@ class RepeatedPoses:
         return float((self.size / self.variance).sum() / len(self.group))
 
     def folds(self, n_folds: int) -> NDArray[np.intp]:
-        """(V,) fold of each view; views of one pose are in the same fold."""
-        return folds_of(self.n_poses, n_folds)[self.group]
+        """(V,) fold of each view; views of one group are in the same fold."""
+        return folds_of(self.n_groups, n_folds)[self.group]
 
     def summed(self, of_views: Array) -> Array:
-        """Sum values of the views (V, ...) over the views of each pose; (P, ...)."""
-        out = np.zeros((self.n_poses, *of_views.shape[1:]))
+        """Sum values of the views (V, ...) over the views of each group; (G, ...)."""
+        out = np.zeros((self.n_groups, *of_views.shape[1:]))
         np.add.at(out, self.group, of_views)
         return out
 
@@ -79,10 +87,14 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
     `errors` (N, 2) are its normalised residuals, in the order of the views' points.
     """
     noise = float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
-    group = _by_distance(_seen(views, state), max(_STILL / views.pixel_scale, _NOISE * noise))
-    if int(group.max()) + 1 == len(group):
-        return RepeatedPoses(group, 0.0)
-    return RepeatedPoses(group, _correlation(views, errors, group))
+    pose = _by_distance(_seen(views, state), max(_STILL / views.pixel_scale, _NOISE * noise))
+    V, variance = len(pose), variance_of_following(views, state, errors, pose)
+    if variance > 1.0:
+        n = max(int(V / variance), 1)
+        return RepeatedPoses(pose, np.arange(V) * n // V, min((variance - 1.0) / (V / n - 1.0), 1.0))
+    if int(pose.max()) + 1 == V:
+        return RepeatedPoses(pose, pose, 0.0)
+    return RepeatedPoses(pose, pose, _correlation(views, errors, pose))
 
 
 def _seen(views: Views, state: CameraState) -> Array:

@@ -69,7 +69,7 @@ def with_rich_lens(
 def _rich_lens(solution: Solution) -> Solution | None:
     """Fit a rich lens on the given target; None if it, or already its prediction, is not good enough."""
     problem, target, size = solution.problem, solution.target, solution.problem.points.image_size
-    if problem.views.n_views < _FEWEST or solution.alike < _ALIKE or solution.repeated.n_poses < _FEWEST:
+    if problem.views.n_views < _FEWEST or solution.alike < _ALIKE or solution.repeated.n_groups < _FEWEST:
         return None
     repeated, held = solution.repeated, contest(solution.minimum, size)
     # What differs from view to view may be the lens: other parts of it are seen.

@@ -274,7 +274,7 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     """Whether there are enough independent views to estimate the target."""
     problem = solution.problem
     points = problem.points if known is None else known.straightened(problem.points)
-    if not views_suffice([points], known, solution.repeated.n_poses):
+    if not views_suffice([points], known, solution.repeated.n_groups):
         return False
     # Errors common to repeated views look like errors of the target.
     return choice != "auto" or not solution.repeated.worth < _WORTH

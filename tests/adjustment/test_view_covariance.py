@@ -23,7 +23,7 @@ NO_SKEW = np.array([1, 0, 1, 1, 1], dtype=bool)
 
 
 def own_poses(n: int) -> RepeatedPoses:
-    return RepeatedPoses(np.arange(n), 0.0)
+    return RepeatedPoses(np.arange(n), np.arange(n), 0.0)
 
 
 # Tables of chi-squared: 5 % and 1 %, and 1 in 10,000.

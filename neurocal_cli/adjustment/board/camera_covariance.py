@@ -106,7 +106,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     grown = np.inf  # a surveyed target absorbs no more than the stated errors of its points
     if seen.target is not None and seen.target.stated is None:
         assert m.repeated is not None
-        few = _GROWN_OF_FEW if m.repeated.n_poses <= _FEW else np.inf
+        few = _GROWN_OF_FEW if m.repeated.n_groups <= _FEW else np.inf
         grown = few if seen.target.bends is None else _GROWN
     found = counting_views(plain, m, n, basis.moves_without, grown)
     known = CameraCovariance(basis, plain, found)
