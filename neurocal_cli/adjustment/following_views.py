@@ -25,27 +25,33 @@ from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.geometry import Array, distinct_rows
 from neurocal_cli.camera.state import CameraState
 
-_FEWEST = 10  # views, and points of the target: fewer do not tell such a correlation from noise
+_FEWEST = 15  # views, and points of the target: fewer do not tell such a correlation from noise
 _POINTS = 50  # most points of the target that are used
 _CERTAIN = 5.0  # standard deviations of a correlation that is chance
-_NO_MORE = 2.0  # the same for the last one that counts
+_LEAST = 0.3  # least correlation: photographs of paper boards, which bend, have up to 0.25
+_NO_MORE = 2.0  # the same standard deviations for the last one that counts
+_GONE = 0.1  # correlation of views that count as independent
 _PER_COEFFICIENT = 4  # points for each coefficient of the smooth field
 _FLAT = 1e-10  # relative size below which a column is rounding
 
 
-def variance_of_following(views: Views, state: CameraState, errors: Array, pose: NDArray[np.intp]) -> float:
-    """Variance of a parameter relative to that of independent views; 1 if those that follow each other are.
+def following_views(
+    views: Views, state: CameraState, errors: Array, pose: NDArray[np.intp]
+) -> tuple[int, float]:
+    """Number of views until one is independent, and variance of a parameter over that of independent views.
+
+    Both are 1 if views that follow each other are independent.
 
     `errors` (N, 2) are the normalised residuals in the order of the views' points, `state` is normalised, and
     `pose` (V,) is the number of each view's pose: views of one pose are no evidence.
     """
     V = views.n_views
     if V < _FEWEST or not np.isfinite(errors).all():
-        return 1.0
+        return 1, 1.0
     label = distinct_rows(np.round(views.world / (1e-6 * views.scale[0])))[1]
     count = np.bincount(label)
     if np.count_nonzero(count > V // 2) < _FEWEST:
-        return 1.0
+        return 1, 1.0
     used = np.argsort(-count, kind="stable")[:_POINTS]
     place = np.full(len(count), -1)
     place[used] = np.arange(len(used))
@@ -53,15 +59,19 @@ def variance_of_following(views: Views, state: CameraState, errors: Array, pose:
     index = views.index[kept], place[label[kept]]
     seen, dense, local = (np.zeros((V, len(used), n)) for n in (1, 2, 3))
     seen[index], dense[index], local[index] = 1.0, errors[kept], views.local[kept]
-    rho = _correlations(_rough(dense, seen, local), seen, pose)
+    rough = _rough(dense, seen, local)
+    if not _correlations(rough, seen, pose):
+        return 1, 1.0
+    of_camera, of_places = _derivatives(views.of_points(kept), state)
+    J, by_place = np.zeros((V, len(used), *of_camera.shape[1:])), np.zeros((V, len(used), 2, 3))
+    J[index], by_place[index] = of_camera, of_places
+    rho = _correlations(_without_offsets(rough, by_place), seen, pose)
     if not rho:
-        return 1.0
-    of_points = _derivatives(views.of_points(kept), state)
-    J = np.zeros((V, len(used), *of_points.shape[1:]))
-    J[index] = of_points
+        return 1, 1.0
     own = (J**2).sum(axis=(0, 1, 2))
     shared = sum(2 * r * (J[:-n] * J[n:]).sum(axis=(0, 1, 2)) for n, r in enumerate(rho, 1))
-    return max(1.0 + float((shared[own > 0] / own[own > 0]).mean()), 1.0)
+    variance = max(1.0 + float((shared[own > 0] / own[own > 0]).mean()), 1.0)
+    return 1 + sum(r > _GONE for r in rho), variance
 
 
 def _rough(errors: Array, seen: Array, local: Array) -> Array:
@@ -96,15 +106,30 @@ def _correlations(errors: Array, seen: Array, pose: NDArray[np.intp]) -> list[fl
         other = (pose[n:] != pose[:-n])[:, None, None]
         number = 2 * float((seen[:-n] * seen[n:] * other).sum())
         product = float((errors[:-n] * errors[n:] * other).sum())
-        limit = (_NO_MORE if found else _CERTAIN) * power * np.sqrt(number)
-        if not product - far * number > limit:
+        limit = max(_CERTAIN * np.sqrt(number), _LEAST * number) if n == 1 else _NO_MORE * np.sqrt(number)
+        if not product - far * number > power * limit:
             break
         found.append((product / number - far) / (power - far))
     return found
 
 
-def _derivatives(views: Views, state: CameraState) -> Array:
-    """(N, 2, 5 + K) derivatives of the residuals by the camera's parameters, with the poses projected out."""
+def _without_offsets(errors: Array, by_place: Array) -> Array:
+    """(V, P, 2) errors without those that an offset of each point on the target explains in all views.
+
+    `by_place` (V, P, 2, 3) are the derivatives of the residuals by the points' places.
+    """
+    J = np.swapaxes(by_place, 0, 1).reshape(errors.shape[1], -1, 3)
+    own = np.swapaxes(errors, 0, 1).reshape(len(J), -1, 1)
+    across = np.swapaxes(J, 1, 2)
+    left = own - J @ np.linalg.solve(_regular(across @ J), across @ own)
+    return np.asarray(np.swapaxes(left.reshape(len(J), -1, 2), 0, 1))
+
+
+def _derivatives(views: Views, state: CameraState) -> tuple[Array, Array]:
+    """Derivatives of the residuals by the camera's parameters and by the points' places on the target.
+
+    The former (N, 2, 5 + K) have the poses projected out, the latter are (N, 2, 3).
+    """
     batches, K = views.batches, state.k.shape[-1]
     out = np.zeros((len(batches.view), 12 + K, 2, batches.local.shape[2]))
     for chunk in batches.chunks():
@@ -113,7 +138,10 @@ def _derivatives(views: Views, state: CameraState) -> Array:
     camera, poses = J[:, :, camera_columns(K)], J[:, :, POSE]
     across = np.swapaxes(poses, 1, 2)
     camera -= poses @ np.linalg.solve(_regular(across @ poses), across @ camera)
-    return np.asarray(camera.reshape(len(out), -1, 2, 5 + K)[views.index, views.rank])
+    R = state.R[batches.view] / views.scale[batches.view][:, None, None]
+    of_camera = camera.reshape(len(out), -1, 2, 5 + K)[views.index, views.rank]
+    of_places = (poses[:, :, 3:] @ R).reshape(len(out), -1, 2, 3)[views.index, views.rank]
+    return np.asarray(of_camera), np.asarray(of_places)
 
 
 def _regular(normal: Array) -> Array:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.following_views import variance_of_following
+from neurocal_cli.adjustment.following_views import following_views
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -24,6 +24,7 @@ from neurocal_cli.camera.state import CameraState
 # thousand random views are called the same.
 _STILL = 1.0  # px by which the target's points may move, or
 _NOISE = 3.0  # this many standard deviations of their noise, if that is more
+_FEWEST = 3  # blocks of views that follow each other: with one left out, two must still differ
 _ROWS = 100  # rows of the distance matrix computed at a time: they stay in the cache
 
 
@@ -88,9 +89,9 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
     """
     noise = float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
     pose = _by_distance(_seen(views, state), max(_STILL / views.pixel_scale, _NOISE * noise))
-    V, variance = len(pose), variance_of_following(views, state, errors, pose)
-    if variance > 1.0:
-        n = max(int(V / variance), 1)
+    V, (length, variance) = len(pose), following_views(views, state, errors, pose)
+    if length > 1:
+        n = max(V // length, _FEWEST)
         return RepeatedPoses(pose, np.arange(V) * n // V, min((variance - 1.0) / (V / n - 1.0), 1.0))
     if int(pose.max()) + 1 == V:
         return RepeatedPoses(pose, pose, 0.0)

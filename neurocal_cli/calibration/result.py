@@ -265,15 +265,15 @@ def _lens_warnings(solution: Solution) -> Iterator[str]:
 def _view_warnings(solution: Solution) -> Iterator[str]:
     """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
     points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
-    if repeated.n_poses < views.n_views and not are_normalised(points.pixels):
-        yield (
-            f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
-            "views that repeat a pose count as one"
-        )
-    elif not repeated.none:
+    if repeated.n_groups < repeated.n_poses:
         yield (
             "the points' errors last from view to view, as in a video; the "
             f"{views.n_views} views count as {max(repeated.worth * views.n_views, 1.0):.0f}"
+        )
+    elif not (repeated.none or are_normalised(points.pixels)):
+        yield (
+            f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
+            "views that repeat a pose count as one"
         )
     yield from filter(None, [scale_of(points).contradiction])
     # The camera is right nevertheless.

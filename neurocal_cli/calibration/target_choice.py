@@ -29,13 +29,14 @@ from neurocal_cli.adjustment.board.find import (
     enough_views,
     find_target,
     gain_over_given,
+    of_all_views,
 )
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
-from neurocal_cli.adjustment.solution import Solution, TrainingRecord
+from neurocal_cli.adjustment.solution import Solution, TrainingRecord, of_few_views
 from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_intrinsics
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
@@ -223,11 +224,11 @@ def _searched(
     if not _can_tell(solution, choice, None):
         return solution, rejected
     kept = solution.noted(target_kept=choice == "auto")
-    common = _found(solution, choice, None)
-    found = common if choice == "flat" else _with_bends(solution, common)
+    common, few = _found(solution, choice, None), _independent(solution, choice)
+    found = common if choice == "flat" or few is not solution else _with_bends(solution, common)
     if found is not None and choice == "auto":
-        fit, named = (solution.problem, solution.adjusted), solution.has_named_lens
-        if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated):
+        fit, named = (few.problem, few.adjusted), solution.has_named_lens
+        if contradicts_sigma(solution) or has_other_cause([fit], found, named, few.repeated):
             return kept, rejected
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):
@@ -274,14 +275,21 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     """Whether there are enough independent views to estimate the target."""
     problem = solution.problem
     points = problem.points if known is None else known.straightened(problem.points)
-    if not views_suffice([points], known, solution.repeated.n_groups):
-        return False
-    # Errors common to repeated views look like errors of the target.
-    return choice != "auto" or not solution.repeated.worth < _WORTH
+    return views_suffice([points], known, solution.repeated.n_groups)
+
+
+def _independent(solution: Solution, choice: str) -> Solution:
+    """The solution for one view of each group with the same errors, which look like errors of the target."""
+    if choice != "auto" or not solution.repeated.worth < _WORTH:
+        return solution
+    return of_few_views(solution, solution.repeated.n_groups)
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
+    few = _independent(solution, choice)
+    found = find_shape([(few.problem, few.adjusted)], choice, known, solution.model_errors is None)
+    fits = [(solution.problem, solution.adjusted)]
+    return found if found is None or few is solution else of_all_views(found, fits, known)
 
 
 def _fitted_to(

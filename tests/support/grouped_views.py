@@ -1,4 +1,4 @@
-"""Views that are not independent: frames of a still video, a focus that moves, a board that curls."""
+"""Views that are not independent: frames of a video, a focus that moves, a board that curls."""
 
 from __future__ import annotations
 
@@ -70,6 +70,30 @@ def frames(n_poses: int, n_frames: int, rng: np.random.Generator, own: float) ->
     pixels = still.pixels[rows] + own * rng.normal(size=(len(rows), 2))
     names = np.repeat([f"f{k:03d}" for k in range(n_poses * n_frames)], COLS * ROWS)
     return replace(still, world=still.world[rows], pixels=pixels, view=names)
+
+
+def moving(
+    n: int, rng: np.random.Generator, lasting: float, curl: float = 0.0, noise: float = 0.12
+) -> Correspondences:
+    """Frames of a board that moves smoothly; `lasting` is the correlation of errors from frame to frame."""
+    phase, rate, share = (
+        rng.uniform(0, 2 * np.pi, (6, 3)),
+        rng.uniform(0.5, 2.0, (6, 3)),
+        rng.uniform(0.3, 1, (6, 3)),
+    )
+    share /= share.sum(axis=1, keepdims=True)
+    path = (share * np.sin(2 * np.pi * rate * np.arange(n)[:, None, None] / n + phase)).sum(axis=2)
+    views = []
+    for x, y, z, a, b, c in path:
+        R = Pose.from_euler(0.8 * a, 0.8 * b, 0.6 * c, np.zeros(3)).R
+        views.append(
+            Pose(R, np.array([0.2 * x, 0.15 * y, 1.0]) * 420 * (1 + 0.3 * z) - R @ board().mean(axis=0))
+        )
+    exact = photographed(views, rng, 0.0, curl=curl)
+    error = noise * rng.normal(size=(n, COLS * ROWS, 2))
+    for k in range(1, n):
+        error[k] = lasting * error[k - 1] + np.sqrt(1 - lasting**2) * error[k]
+    return replace(exact, pixels=exact.pixels + error.reshape(-1, 2))
 
 
 def rescaled(points: Correspondences, which: Array, times: float) -> Correspondences:

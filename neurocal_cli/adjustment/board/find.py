@@ -118,8 +118,11 @@ def find_target(
     if some is None:
         return None
     found = Search(some, flat, known).result(least_gain, least)
-    if found is None or some is fits:
-        return found
+    return found if found is None or some is fits else of_all_views(found, fits, known)
+
+
+def of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
+    """The same target with other fits, for the given target or a `known` one, adjusted to it."""
     moved = []
     for problem, adjusted in fits:
         points = problem.points if known is None else known.as_given(problem.points)
