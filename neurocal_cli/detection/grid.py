@@ -87,6 +87,14 @@ class Measured:
     # [px] displacement of the edges towards the dark side by gamma, ink spread and blooming; already removed
     polarity: float
 
+    @classmethod
+    def of_vertices(
+        cls, index: NDArray[np.int64], pixels: Array, spread: Array, vertices: Array, polarity: float = 0.0
+    ) -> Measured:
+        """Points that are measured in both directions, with covariances `spread` (N, 2, 2) [px^2]."""
+        kind, covariance = np.full(len(pixels), VERTEX, dtype=np.int64), spread.reshape(-1, 4)[:, [0, 1, 3]]
+        return cls(kind, index, pixels, covariance, None, vertices, 0, polarity)
+
     def only(self, good: NDArray[np.bool_]) -> Measured:
         """Keep the points of a mask (N,); the others are counted as rejected."""
         known = {name: values for name in _OF_POINTS if (values := getattr(self, name)) is not None}

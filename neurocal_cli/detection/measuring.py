@@ -54,7 +54,7 @@ from neurocal_cli.detection.fitting.map_fit import select_map
 from neurocal_cli.detection.fitting.strips import GridEdges, GridImage, grid_lines
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
 from neurocal_cli.detection.grey import least_variance
-from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Grid, Measured
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
 from neurocal_cli.detection.medians import upper_median
@@ -201,20 +201,10 @@ def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measur
     offsets = fit.values[:, [FIRST, SECOND]]
     pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
     spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]] * fit.variance_growth[:, None, None]
-    spread = inverse @ spread @ inverse.swapaxes(1, 2)
-    uneven = fitted.unevenness
-    covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
+    spread = inverse @ spread @ inverse.swapaxes(1, 2) + fitted.unevenness * np.eye(2)
     vertices[grid_image.grid.seen] = np.where(good[:, None], pixels, np.nan)
-    return Measured(
-        kind=np.full(len(pixels), VERTEX, dtype=np.int64),
-        index=grid_image.vertices.astype(np.int64),
-        pixels=pixels,
-        covariance=covariance,
-        across=None,
-        vertices=vertices,
-        rejected=0,
-        polarity=_polarity(fitted),
-    ).only(good)
+    index = grid_image.vertices.astype(np.int64)
+    return Measured.of_vertices(index, pixels, spread, vertices, _polarity(fitted)).only(good)
 
 
 @frozen_dataclass(eq=False)

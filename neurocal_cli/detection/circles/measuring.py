@@ -50,7 +50,7 @@ from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import LocalInverse, SmoothMap
 from neurocal_cli.detection.fitting.strips import ANCHOR, GridImage, Single, packed
 from neurocal_cli.detection.grey import eight_bits, least_variance
-from neurocal_cli.detection.grid import VERTEX, Grid, Measured
+from neurocal_cli.detection.grid import Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.detection.placement import NoBoardError, Placement
@@ -227,20 +227,10 @@ def measure_circles(
         if done >= _ROUNDS and moved < _SETTLED * np.sqrt(upper_median(fit.covariance[some, 0, 0])):
             break
     uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
-    spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None]
-    covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
+    spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None] + uneven * np.eye(2)
     vertices = np.full((plane.rows, plane.cols, 2), np.nan)
     vertices[index[good, 1], index[good, 0]] = centre[good]
-    return Measured(
-        kind=np.full(len(index), VERTEX, dtype=np.int64),
-        index=index,
-        pixels=centre,
-        covariance=covariance,
-        across=None,
-        vertices=vertices,
-        rejected=0,
-        polarity=0.0,
-    ).only(good)
+    return Measured.of_vertices(index, centre, spread, vertices).only(good)
 
 
 def _band(
