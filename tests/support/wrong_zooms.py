@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from simulated_zoom import see
 
 from neurocal_cli.calibration.zoom.fit import fit_lens
 from neurocal_cli.calibration.zoom.judgement import judge_lens
@@ -16,7 +17,7 @@ from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.observations.points import Correspondences
-from support.zoom_laws import grid, seen
+from support.zoom_laws import POSE, SIZE, THETA, grid, seen, truth
 
 TOPOLOGIES = ((0, 1), (0, 2))
 _ONE = 7  # the setting that is spoilt alone, in the middle of the range
@@ -87,6 +88,18 @@ def noisy(points: Correspondences, at: Array) -> dict[str, Array]:
     return {"pixels": points.pixels + np.where((at == _ONE)[:, None], noise, 0.0)}
 
 
+def of_a_part(factor: float, jump: tuple[float, float]) -> LensPoints:
+    """A third of the settings, in no order, has another focal length or image centre."""
+    settings = grid(5, 3)
+    parameters = truth("c", settings) | {"k1": np.zeros(len(settings))}
+    part = np.random.default_rng(2).permutation(len(settings)) % 3 == 1
+    for name in ("alpha_u", "alpha_v"):
+        parameters[name] = parameters[name] * np.where(part, factor, 1.0)
+    for name, shift in zip(("u0", "v0"), jump, strict=True):
+        parameters[name] = parameters[name] + np.where(part, shift, 0.0)
+    return see(parameters, settings, POSE, THETA, SIZE, 5, 0.15, np.random.default_rng(1))
+
+
 def pairing(points: Correspondences, at: Array) -> dict[str, Array]:
     return {"world": np.where((at == _ONE)[:, None], np.roll(points.world, 1, axis=0), points.world)}
 
@@ -103,5 +116,10 @@ WRONG: dict[str, tuple[Callable[[], LensPoints], str]] = {
     "the image of one setting at half size": (lambda: _changed(half_size), "left out|setting"),
     "the target moved half way": (lambda: _changed(target_moved), "noise floor|moved"),
     "one setting with wrong pixels": (lambda: _changed(noisy), "left out"),
+    "a teleconverter at a third of the settings": (lambda: of_a_part(1.4, (0.0, 0.0)), "noise floor"),
+    "a lens refitted for a third of the settings": (
+        lambda: of_a_part(1.0, (4.0, -3.0)),
+        "noise floor",
+    ),
     "one setting with points in wrong order": (lambda: _changed(pairing), "left out|setting"),
 }

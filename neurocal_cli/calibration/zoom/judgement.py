@@ -152,8 +152,9 @@ CAUSES = (
     ),
     ZoomCause(
         "settings that contradict each other", "with a camera for each setting, only noise is left",
-        "check that the lens returns to the same position, that camera and target stay where they are "
-        "(or give --camera moving), and that the settings have their true names",
+        "check that the lens returns to the same position and was never taken off or on a teleconverter, "
+        "that camera and target stay where they are (or give --camera moving), and that the settings have "
+        "their true names",
         _contradict, ELSEWHERE, lambda lens: lens.noise_floor_px,
     ),
     ZoomCause(
