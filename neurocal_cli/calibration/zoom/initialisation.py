@@ -161,13 +161,9 @@ def _completed(data: PixelData, static: StaticFit, progress: Progress | None) ->
     known = CalibratedSettings.of(*_some(data, static, good), progress)
     settings, table, L = data.lens.settings, known.tables, static.local.shape[1]
     x = scaled_controls(settings, settings.min(axis=0), settings.max(axis=0))
-    members = fit_committee(
-        x[good], data.names, table.local, table.normal.S, known.variance, np.random.default_rng(0),
-        _QUICK_BUDGET, lambda share: None,
-    )  # fmt: skip
+    predicted = _predicted(known, x[good], np.ones(int(good.sum()), dtype=bool), x[~good], 0)
     nearest = ((x[~good, None] - x[good]) ** 2).sum(axis=-1).argmin(axis=1)
     donor = table.local[nearest]
-    predicted = np.mean([nets.local(x[~good]) for nets in members], axis=0)
     predicted = np.where(are_cameras(predicted)[:, None], predicted, donor)
     own = np.diagonal(local_covariance(table.normal, L, known.variance), axis1=1, axis2=2)[nearest]
     local, precision = static.local.copy(), np.zeros_like(static.local)
@@ -180,6 +176,14 @@ def _completed(data: PixelData, static: StaticFit, progress: Progress | None) ->
             for name, pose in poses_seen(data.lens, s, data.model, local[s], theta).items():
                 R[number[name]], t[number[name]] = pose.R, pose.t
     return replace(static, local=local, R=R, t=t, precision=precision)
+
+
+def _predicted(start: CalibratedSettings, x: Array, part: NDArray[np.bool_], to: Array, seed: int) -> Array:
+    """Local parameters (n, L) at controls (n, D) by networks of some settings, whose controls are x."""
+    local, S = start.tables.local[part], start.tables.normal.S[part]
+    rng = np.random.default_rng(seed)
+    members = fit_committee(x[part], start.data.names, local, S, start.variance, rng, _QUICK_BUDGET)
+    return np.asarray(np.mean([nets.local(to) for nets in members], axis=0))
 
 
 def poses_seen(lens: LensPoints, s: int, model: str, local: Array, theta: float) -> dict[str, Pose]:
@@ -264,14 +268,9 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> dict[tuple[floa
     inside = np.arange(len(x)) % 2 == 0
     squares = np.zeros(len(x))
     for part in (inside, ~inside):
-        rng, names, local = np.random.default_rng(options.seed), start.data.names, start.tables.local
-        H = start.tables.normal.S[part]
-        members = fit_committee(
-            x[part], names, local[part], H, start.variance, rng, _QUICK_BUDGET, lambda share: None
-        )
-        predicted = np.mean([nets.local(x) for nets in members], axis=0)
-        there = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
-        cost = there.normal.cost
+        predicted = _predicted(start, x, part, x, options.seed)
+        local = np.where(part[:, None], start.tables.local, predicted)
+        cost = start.data.linearise(local, start.tables.constants).normal.cost
         squares[~part] = cost[~part] if np.isfinite(cost).all() else np.inf
     settings = map(tuple, start.lens.settings.tolist())
     return dict(zip(settings, (squares / start.data.counts).tolist(), strict=True))

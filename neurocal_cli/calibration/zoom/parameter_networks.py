@@ -233,7 +233,7 @@ def fit_committee(
     variance: float,
     rng: np.random.Generator,
     budget: Budget,
-    report: Callable[[float], None],
+    report: Callable[[float], None] = lambda share: None,
 ) -> tuple[LensNets, ...]:
     """Fit networks to tables of local parameters (S, L) at scaled controls (S, D), one parameter at a time.
 
@@ -245,37 +245,32 @@ def fit_committee(
     # A grid over the whole range of the controls.
     probe = np.array(list(product(np.linspace(-1, 1, _GRID), repeat=x.shape[1])))
     L = len(names)
-    first = [j for j, name in enumerate(names) if name == "t_z"]
-    rest = [2, 3, *range(4 + len(first), L)]
-    values, held = local.copy(), np.zeros(L, dtype=bool)
+    values, held = local.copy(), np.array([name == "t_z" for name in names])
     chosen: dict[int, list[ParameterNet]] = {}
 
-    def choose(columns: list[int], found: list[tuple[list[ParameterNet], float]]) -> None:
-        for j, (nets, _) in zip(columns, found, strict=True):
-            chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
+    def choose(j: int, nets: list[ParameterNet]) -> None:
+        chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
 
-    def one(j: int) -> _Targets:
-        return _Targets(values[:, j], spread[:, j])
-
-    if first:
+    values, spread = _given(local, values, H, variance, np.zeros(L, dtype=bool))
+    alone = int(held.sum())  # whether t_z is fitted before all others
+    for j in np.flatnonzero(held).tolist():
+        ((nets, _),) = _fit(x, [_Targets(values[:, j], spread[:, j])], rng, budget, lambda k: report(k / L))
+        choose(j, nets)
+        values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
         values, spread = _given(local, values, H, variance, held)
-        choose(first, _fit(x, [one(j) for j in first], rng, budget, lambda share: report(0.3 * share)))
-        values[:, first[0]] = np.mean([net.output(x) for net in chosen[first[0]]], axis=0)
-        held[first] = True
-    values, spread = _given(local, values, H, variance, held)
-    scales = []
+    plain = [2, 3, *range(4 + alone, L)]
+    targets = [_Targets(values[:, j], spread[:, j]) for j in plain]
     for scale in SCALES:
         of_alpha, derivative = to_scale(scale, values[:, 0])
-        scales.append(_Targets(of_alpha, spread[:, 0] * derivative**2, derivative))
-    ratio = _Targets(np.log(values[:, 1] / values[:, 0]), spread[:, 1] / values[:, 1] ** 2)
-    start = 0.3 if first else 0.0
-    found = _fit(
-        x, [*map(one, rest), *scales, ratio], rng, budget, lambda share: report(start + (1 - start) * share)
-    )
-    fits = dict(zip(SCALES, found[len(rest) : -1], strict=True))
+        targets.append(_Targets(of_alpha, spread[:, 0] * derivative**2, derivative))
+    targets.append(_Targets(np.log(values[:, 1] / values[:, 0]), spread[:, 1] / values[:, 1] ** 2))
+    found = _fit(x, targets, rng, budget, lambda k: report((alone + (L - alone) * k) / L))
+    for j, (nets, _) in zip([*plain, 1], [*found[: len(plain)], found[-1]], strict=True):
+        choose(j, nets)
+    fits = dict(zip(SCALES, found[len(plain) : -1], strict=True))
     best = max(fits, key=lambda name: fits[name][1])
     scale = best if fits[best][1] > fits["log"][1] + _LOG_ODDS else "log"
-    choose([*rest, 0, 1], [*found[: len(rest)], fits[scale], found[-1]])
+    choose(0, fits[scale][0])
     return tuple(LensNets(scale, tuple(chosen[j][k] for j in range(L))) for k in range(budget.members))
 
 
@@ -284,7 +279,7 @@ def _given(
 ) -> tuple[Array, Array]:
     """Tables with some parameters held at other values, and the variances of the rest; (S, L) both."""
     if H is None:
-        return local, np.zeros_like(local)
+        return local.copy(), np.zeros_like(local)
     free = np.flatnonzero(~held)
     pull = -(H[:, free[:, None], np.flatnonzero(held)] @ (values - local)[:, held, None])
     B = H[:, free[:, None], free]

@@ -376,6 +376,18 @@ def test_networks_through_all_known_cameras_do_not_make_them_exact() -> None:
     assert not lens.warnings
 
 
+def test_given_distances_stay_and_their_errors_are_told() -> None:
+    cameras, _, _ = known_cameras(12, 0)
+    errors = 5 * np.random.default_rng(1).normal(size=12)
+    t_z = 1500 - 0.02 * cameras.settings[:, 0] + errors
+    with_t_z = replace(cameras, names=(*cameras.names, "t_z"), local=np.column_stack([cameras.local, t_z]))
+    lens = fit_lens_cameras(with_t_z, topologies=((0, 0),))
+    np.testing.assert_array_equal(with_t_z.local[:, 4], t_z)
+    prediction = lens.predict(cameras.settings)
+    away = prediction.local[:, 4] - (t_z - errors)
+    assert np.sqrt(np.mean((away / prediction.std[:, 4]) ** 2)) < 2
+
+
 def test_a_wrong_number_in_a_table_of_cameras_is_told() -> None:
     for name, row, factor, reason in (
         ("alpha_u", 2, 2.0, "the camera at zoom 1500 contradicts"),
