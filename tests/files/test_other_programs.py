@@ -565,12 +565,19 @@ def test_a_known_camera_without_its_model_takes_the_option(tmp_path: Path) -> No
     assert "distortion_model: equidistant" in (tmp_path / "poses.yaml").read_text()
 
 
-def test_toml_is_read_without_python_s_reader(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Python 3.10 has none."""
+@pytest.mark.parametrize("reader", [True, False])
+@pytest.mark.parametrize(
+    "above", ["", "CreationDate = 2023-03-08T10:52:25\n# of the session\n\ncamera_count = 1\n"]
+)
+def test_toml_is_read_also_without_python_s_reader(
+    above: str, reader: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Python 3.10 has none. Keys may stand above the first section, as in caliscope's sessions."""
     name = "neurocal_cli.files.exchange.document.sys"
     text = f'[cam_0]\nname = "A"\nsize = [ 640, 480,]\nmatrix = {K}\ndistortions = {D}\n[metadata]\n'
-    (tmp_path / "rig.toml").write_text(text)
-    monkeypatch.setattr(name, SimpleNamespace(version_info=(3, 10)))
+    (tmp_path / "rig.toml").write_text(above + text)
+    if not reader:
+        monkeypatch.setattr(name, SimpleNamespace(version_info=(3, 10)))
     (camera,) = read_cameras([tmp_path / "rig.toml"]).cameras
     check(camera, CAMERA, FIVE)
     assert (camera.name, camera.image_size) == ("A", (640, 480))

@@ -56,7 +56,9 @@ KALIBR_REPORT = (
 """How the report of Kalibr begins, which is read neither as points nor as cameras, and what to do."""
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(
-    r"\A(?:[^\S\n]*(?:[#;][^\n]*)?\n)*[^\S\n]*\[[^\]\n,]+\][^\S\n]*(?:[#;][^\n]*)?(?:\n|\Z)"
+    # TOML may have keys above the first section.
+    r"\A((?:[^\S\n]*(?:[#;][^\n]*|\w+[ \t]*=[ \t]*[^\s\[][^\n]*)?\n)*)"
+    r"[^\S\n]*\[[^\]\n,]+\][^\S\n]*(?:[#;][^\n]*)?(?:\n|\Z)"
 ).match
 # name = numbers or name: numbers, as programs print them and scripts state them.
 _STATED = re.compile(
@@ -301,7 +303,8 @@ def sections(text: str, source: str) -> dict[str, Any]:
     parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
     parser.optionxform = str  # type: ignore[assignment, method-assign]
     try:
-        parser.read_string(text)
+        above = match.end(1) if (match := _SECTION(text)) else 0
+        parser.read_string("\n" * text[:above].count("\n") + text[above:])
     except configparser.Error as error:
         line = getattr(error, "lineno", None)
         raise FormatError("is neither TOML nor sections of key = value; correct it", source, line) from error
