@@ -170,7 +170,8 @@ def points_given_twice(points: Correspondences) -> Iterator[Finding]:
 
 def _own_points(points: Correspondences) -> NDArray[np.intp]:
     """(N,) a number for each point of each view, the same for the same point."""
-    _, label = distinct_rows(np.round(points.world, 6))
+    extent = float(np.ptp(points.world, axis=0).max())
+    _, label = distinct_rows(np.round(points.world / (extent or 1.0), 9))
     return np.asarray(points.view_index * (label.max() + 1) + label, dtype=np.intp)
 
 

@@ -104,9 +104,12 @@ def test_a_point_just_outside_the_border_is_no_fault_and_one_far_outside_not_poo
     assert (grade, reason) == (1, "1 point lies outside the image")
 
 
-def test_two_images_under_one_name_are_named() -> None:
+@pytest.mark.parametrize("unit", [1.0, 1e-8])
+def test_two_images_under_one_name_are_named_in_any_unit(unit: float) -> None:
+    """A grid of 25 micrometres in kilometres is no single point."""
+    assert list(points_given_twice(moved(POINTS, unit * POINTS.world))) == []
     names = np.where(np.asarray(POINTS.view) == "view01", "view00", np.asarray(POINTS.view))
-    points = Correspondences(POINTS.world, POINTS.pixels, names, POINTS.image_size)
+    points = Correspondences(unit * POINTS.world, POINTS.pixels, names, POINTS.image_size)
     ((_, reason, _),) = points_given_twice(points)
     assert reason.startswith("view00: most points are given twice with different pixels, as of two images")
 
