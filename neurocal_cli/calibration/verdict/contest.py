@@ -29,7 +29,15 @@ from neurocal_cli.calibration.verdict.findings import (
     or_else,
 )
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
-from neurocal_cli.calibration.verdict.rival import Estimate, Known, Rival, Told, estimates, including
+from neurocal_cli.calibration.verdict.rival import (
+    Estimate,
+    Known,
+    Rival,
+    Told,
+    estimates,
+    given_changes,
+    including,
+)
 from neurocal_cli.calibration.verdict.rivals import (
     ANOTHER_LENS,
     EFFECTS,
@@ -251,7 +259,8 @@ def _fitted(lin: Linearised, one: Estimate) -> Estimate | None:
         of_entries = lin.free < 5
         camera[of_entries] = step[lin.free[of_entries]]
         if one.rival.of_given and one.rival.steps_at(lin)[:5].any():
-            amounts = step[lin.given[lin.given != 1]] / lin.state.entries[0, 0]
+            steps = one.rival.steps_at(lin)[:5]
+            amounts = step @ steps / (steps**2).sum(axis=0)
     return replace(
         one, evidence=one.evidence + 0.5 * n * float(np.log(left / cost)), explained=1.0 - cost / lin.cost,
         amounts=amounts, camera=camera, noise=cost / n,
@@ -343,11 +352,11 @@ def _is_uncertain(found: Estimate, contest: Contest, calibration: Calibration) -
     std, lin = calibration.std_of_given, contest.lin
     if found.rival.steps_at(lin)[5:].any():
         return False
-    places = lin.given[lin.given != 1].tolist()
     alpha = float(lin.state.entries[0, 0]) * lin.views.pixel_scale
     names = ("alpha_u", "theta", "alpha_v", "u0", "v0")
-    known = zip(places, found.amounts.tolist(), strict=True)
-    return all(abs(by) * alpha <= BIASED.poor * std.get(names[k], 0.0) for k, by in known)
+    return all(
+        abs(by) * alpha <= BIASED.poor * std.get(names[k], 0.0) for k, by in given_changes(lin, found).items()
+    )
 
 
 def closest(contest: Contest | None, calibration: Calibration) -> str:

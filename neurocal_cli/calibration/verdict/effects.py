@@ -185,6 +185,13 @@ def given(lin: Linearised) -> Array:
     return steps
 
 
+def given_scale(lin: Linearised) -> Array:
+    """One change of both given focal lengths, as by another focus or image size."""
+    steps = given(lin).sum(axis=1, keepdims=True)
+    steps[3:] = 0.0
+    return steps[:, : int({0, 2} <= set(lin.given.tolist()))]
+
+
 def given_lens(lin: Linearised) -> Array:
     """A change of the given coefficients of the lens, if the focal length is given; k1 and k2 without any."""
     of_model = lin.columns["lens"][0] - 5 if lin.columns["lens"].size else len(lin.state.k)

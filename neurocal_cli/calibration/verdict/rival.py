@@ -136,6 +136,12 @@ class Rival(Cause[Told]):
 Estimate = Found[Rival]
 
 
+def given_changes(lin: Linearised, found: Estimate) -> dict[int, float]:
+    """Changes of the given focal lengths and centre over the focal length, by the place of the entry in A."""
+    changes = (found.rival.steps_at(lin) @ found.amounts) / lin.state.entries[0, 0]
+    return {k: float(changes[k]) for k in lin.given.tolist() if k != 1}
+
+
 @quietly
 def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float = 0.0) -> list[Estimate]:
     """The rivals with their most probable patterns, the most probable rival first.

@@ -44,15 +44,18 @@ RICHER_LENSES = tuple(
 
 RIVALS: tuple[Rival, ...] = (
     *RICHER_LENSES,
-    Rival(
-        "a wrong given parameter",
-        "the given focal length or centre, moved, takes the residuals away",
-        SAME,
-        words.wrongly_given,
-        CHANGED,
-        effects.common,
-        steps=effects.given,
-        of_given=True,
+    *(
+        Rival(
+            "a wrong given parameter",
+            "the given focal length or centre, moved, takes the residuals away",
+            SAME,
+            words.wrongly_given,
+            CHANGED,
+            effects.common,
+            steps=steps,
+            of_given=True,
+        )
+        for steps in (effects.given, effects.given_scale)  # one unknown is told from less than four are
     ),
     Rival(
         "a wrong given distortion",

@@ -19,7 +19,7 @@ from neurocal_cli.calibration.verdict.findings import (
     percent,
     two_digits,
 )
-from neurocal_cli.calibration.verdict.rival import Say, Told
+from neurocal_cli.calibration.verdict.rival import Say, Told, given_changes
 from neurocal_cli.camera.geometry import Array
 
 NEAR = 0.02
@@ -273,20 +273,19 @@ def too_simple(model: str) -> Say:
 
 def wrongly_given(told: Told) -> Said:
     """Given focal lengths and centre, what the points have, and what that does to the poses."""
-    lin, amounts = told.lin, told.found.amounts
-    places = lin.given[lin.given != 1].tolist()
-    largest = float(np.abs(amounts).max())
-    if lin.state.square and len(places) == 1:
-        amount = float(amounts[0])
+    lin, changes = told.lin, given_changes(told.lin, told.found)
+    largest = max(map(abs, changes.values()))
+    if lin.state.square and len(changes) == 1:
+        (amount,) = changes.values()
         return f"the pixels are not square: alpha_v - alpha_u is {100 * amount:+.2g} % of alpha_u", largest
-    if lin.views.n_views < DETERMINE and len(places) > 2:
+    if lin.views.n_views < DETERMINE and len(changes) > 2:
         text = "the given camera does not fit these points: another focal length or centre does"
         return text + _poses(told), largest
     names: Mapping[int, str] = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
     before = lin.state.entries[0] * lin.views.pixel_scale + [0, 0, 0, *lin.views.pixel_centre]
     by = [
         f"{names[k]} = {before[k]:.5g} is given, but the points give {before[k] + a * told.alpha:.5g} px"
-        for k, a in zip(places, amounts.tolist(), strict=True)
+        for k, a in changes.items()
         if abs(a) > _SOME * largest
     ]
     return ", ".join(by) + _poses(told), largest

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -17,7 +18,7 @@ from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, calibrate
 from neurocal_cli.calibration.verdict.evidence import Evidence
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.monotonic import largest_angle
@@ -50,6 +51,21 @@ def test_a_given_focal_length_that_is_off_is_named() -> None:
     verdict = calibrate(four_views(), type=3, intrinsics=camera).verdict
     assert verdict is not None
     assert "alpha_u = 640 is given, but the points give 60" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("trial", slow_but([2, 10], [2, 4, 10, 11]))
+def test_focal_lengths_that_are_wrong_by_one_factor_are_told_from_five_views(trial: int) -> None:
+    """Half a percent, as of another focus: the poses are many of their standard deviations off."""
+    rng = np.random.default_rng([trial, 14])
+    scene = random_flat_set(rng, 5, False, cols=9, rows=6, f=1000.0, width=1280)
+    points, given = scene.points(0.4, rng), scene.given(3)
+    true = camera_of(given["intrinsics"])
+    for factor, named in ((1.005, True), (1.0, False)):
+        of_both = true.intrinsics.alpha_u * factor, true.intrinsics.alpha_v * factor
+        wrong = replace(true.intrinsics, alpha_u=of_both[0], alpha_v=of_both[1])
+        verdict = calibrate(points, type=3, intrinsics=replace(true, intrinsics=wrong)).verdict
+        assert verdict is not None
+        assert any("is given, but the points give" in reason for reason in verdict.reasons) == named
 
 
 @pytest.mark.parametrize("trials", [10, pytest.param(200, marks=pytest.mark.slow)])
