@@ -81,8 +81,8 @@ class Contest:
     def instead_of_target(self, worth: float = 1.0) -> float:
         """Log odds of causes other than the target's shape, known or not; 0 if there are none.
 
-        The level by which they have to beat the target's shape is taken off. An equation is `worth` so much
-        for that shape.
+        The level by which they have to beat the target's shape is taken off; a given value, which the shape
+        takes in, comes first if it is hardly less probable. An equation is `worth` so much for that shape.
         """
         first = self.causes[0] if self.causes else None
         if first is None:
@@ -95,7 +95,7 @@ class Contest:
         others = [one.evidence for one in known if not one.rival.of_board]
         told = sum(one.evidence for one in self.causes)
         if max(others, default=0.0) > _MUCH * told or first.rival.unknown or first.pattern == "one":
-            return worth * self.evidence - LEVEL
+            return worth * self.evidence + (LEVEL if first.rival.of_given else -LEVEL)
         # A shape that is far more probable than the found one is not open: no print is stretched by percents.
         return worth * told / _FAR_MORE if first.pattern == "all" else 0.0
 
@@ -371,8 +371,11 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal, contest.std_of_poses)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
-    if found.rival.of_given and told.moved_poses > BIASED.poor:
-        grade = max(grade, 1 + int(found.explained > EXPLAINED))
+    # Poses that rest on what is given have no other measure of their bias.
+    moved = found.pattern == "all" and (found.rival.of_given or not contest.lin.free.size)
+    by_poses = BIASED.grade(told.moved_poses) if moved else 0
+    if by_poses:
+        grade = max(grade, 1 + int(by_poses > 1 and found.explained > EXPLAINED))
     # Outliers were left out of the calibration, and what differs from view to view is in the std.
     if not contest.remains or not found.weights.size:
         return grade, reason

@@ -68,6 +68,27 @@ def test_focal_lengths_that_are_wrong_by_one_factor_are_told_from_five_views(tri
         assert any("is given, but the points give" in reason for reason in verdict.reasons) == named
 
 
+@pytest.mark.parametrize(
+    ("what", "trial"),
+    slow_but(
+        [("centre", 30), ("k1", 0)], [("centre", 13), ("centre", 30), *(("k1", k) for k in (0, 2, 3, 4, 5))]
+    ),
+)
+def test_a_given_centre_or_lens_that_is_hardly_wrong_is_not_good(what: str, trial: int) -> None:
+    """The target takes in a wrong centre; a wrong lens moves poses by a few std, at a small error."""
+    rng = np.random.default_rng([trial, 15])
+    scene = random_flat_set(rng, 8, False, cols=9, rows=6, f=850.0, width=640)
+    points, given = scene.points(0.15, rng), scene.given(3)
+    true = camera_of(given["intrinsics"]).intrinsics
+    centre = replace(true, u0=true.u0 + 8.0)
+    lens = Camera(true, Distortion("k1", np.array([0.02])))
+    found = calibrate(points, type=3, intrinsics=centre if what == "centre" else lens)
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word != "good"
+    assert any("given" in reason for reason in found.verdict.reasons)
+
+
 @pytest.mark.parametrize("trials", [10, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_camera_that_is_given_truly_is_within_five_standard_deviations(trials: int) -> None:
     for trial in range(trials):
