@@ -13,10 +13,10 @@ All these cameras project nearly alike, so the covariance at the minimum still h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +36,6 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
-
-if TYPE_CHECKING:
-    from neurocal_cli.adjustment.board.posterior import Posterior
 
 # Least ratio of the squared errors after and before, at the same minimum: the fifteen unknowns of a lens
 # explain a twentieth of 300 residuals.
@@ -98,8 +95,6 @@ class Solution:
     straight_lines: StraightLines | None = None
     # The target if it was estimated with the camera; the problem's points are then those of the target.
     target: Target | None = None
-    # A minimum, and a function that returns the posterior of the target there for a noise variance [px^2].
-    target_posterior: tuple[Adjusted, Callable[[float], Posterior]] | None = None
     target_kept: bool = False  # whether the given target was kept although it could have been estimated
     ambiguity: Ambiguity | None = None  # other cameras that explain the points equally well
     of_all: Solution | None = None  # the fit of all points, if some were rejected afterwards

@@ -125,13 +125,11 @@ def with_given_covariance(found: Calibration, given: Calibration) -> Calibration
 
 def _covariance_of(solution: Solution) -> CameraCovariance:
     """The covariance of camera and poses, normalised."""
-    at, posterior = solution.target_posterior or (None, None)
     return camera_covariance(
         CameraSeen(
             solution.minimum,
             solution.problem.points,
             solution.target,
-            posterior if at is solution.adjusted else None,  # or the camera has been adjusted again
             tuple(solution.model_errors or ()),
             solution.shared,
             solution.by_prior,

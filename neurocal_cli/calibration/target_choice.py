@@ -261,10 +261,7 @@ def _settled(
                 break
             found = refound
         (new, adjusted), *_ = found.fits
-        posterior = None if found.posterior is None else (adjusted, found.posterior)
-        best = replace(
-            fitted, problem=new, adjusted=adjusted, target=found.target, target_posterior=posterior
-        )
+        best = replace(fitted, problem=new, adjusted=adjusted, target=found.target)
         rejected = outliers
         if new.distortion.model == lens:
             break

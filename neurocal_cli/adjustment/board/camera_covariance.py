@@ -7,7 +7,7 @@ over views (`counting_views`), and the model uncertainty of the selected distort
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,6 @@ from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
 if TYPE_CHECKING:
-    from neurocal_cli.adjustment.board.posterior import Posterior
     from neurocal_cli.adjustment.open_choices import OpenCoefficients
 
 # Ratios of the jackknife's variance to the one expected from noise, from which on it is used. For a bend in
@@ -44,8 +43,6 @@ class CameraSeen:
     minimum: Minimum
     points: Correspondences  # with the world coordinates of the estimated target, if any
     target: Target | None = None  # the estimated target
-    # Function that returns the posterior of the target for a variance of the noise, if there is one already.
-    posterior: Callable[[float], Posterior] | None = None
     # Candidate models of the distortion selection; empty if the user named the model.
     choice: Collection[str] = ()
     shared: Array | None = None  # (f, f) covariance of the free parameters, if it comes from elsewhere
@@ -96,7 +93,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
     Raises `numpy.linalg.LinAlgError` if the points do not determine a camera whose target was estimated.
     """
-    basis = _basis(seen, seen.minimum, seen.shared, seen.posterior)
+    basis = _basis(seen, seen.minimum, seen.shared)
     m, n = basis.minimum, basis.n_equations
     plain = seen.plain or m.covariance(n + seen.by_prior, basis.shared)
     if basis.poses is not None:
@@ -164,14 +161,9 @@ def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
     return basis.minimum.variance(basis.n_equations) / worth
 
 
-def _basis(
-    seen: CameraSeen,
-    m: Minimum,
-    shared: Array | None = None,
-    posterior: Callable[[float], Posterior] | None = None,
-) -> CovarianceBasis:
+def _basis(seen: CameraSeen, m: Minimum, shared: Array | None = None) -> CovarianceBasis:
     if seen.target is None:
         return CovarianceBasis(m, shared, m.views.n_equations)
     from neurocal_cli.adjustment.board.uncertainty import covariance_basis
 
-    return covariance_basis(seen.target, m, seen.points, posterior)
+    return covariance_basis(seen.target, m, seen.points)

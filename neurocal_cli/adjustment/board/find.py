@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from neurocal_cli.adjustment.board.posterior import (
     evidence_of_given,
     given_posterior,
     posterior,
-    posterior_of,
 )
 from neurocal_cli.adjustment.board.prior import SINGLE, nearest_to_given, prior_of
 from neurocal_cli.adjustment.board.system import WithoutPoses
@@ -76,14 +75,12 @@ class Found:
     """An estimated target, with the problems and their minima for it.
 
     The points of each problem have the target's coordinates. The log evidence is comparable between
-    distortion models. For a variance of the noise [px^2], `posterior` returns the posterior at this minimum;
-    it is None if not all views were used.
+    distortion models.
     """
 
     target: Target
     fits: tuple[tuple[Problem, Adjusted], ...]
     evidence: float
-    posterior: Callable[[float], Posterior] | None = None
 
 
 def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
@@ -128,7 +125,7 @@ def of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: 
         points = problem.points if known is None else known.as_given(problem.points)
         world = found.target.applied(points).world
         moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
-    return replace(found, fits=tuple(moved), posterior=None)
+    return replace(found, fits=tuple(moved))
 
 
 def _few_enough(
@@ -325,34 +322,16 @@ class Search:
         )  # fmt: skip
         if not self.is_board and max(target.stretch(), target.unequal()) > _STRETCHED:
             return None
-        return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
+        return Found(target, tuple(self.fits), found.evidence)
 
     def _without(self, info: Information) -> float:
         """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
         return evidence_of_given(info.straight() if self.still else info)
 
-    def _posterior_of(self, target: Target, found: Posterior) -> Callable[[float], Posterior]:
-        """The posterior of the estimated target for a variance of the noise [px^2].
-
-        Without bends, that of the last step is taken, which has nearly this variance and alignment.
-        """
-        if self.surface is None:
-            opened = cache(found.opened)
-            return lambda variance: opened()
-        if self.still:
-            info = self._of_held_points()
-        else:
-            info = self._in_offsets(information_of(self.sights(), len(self.given)))
-        return partial(posterior_of, target, info, self.prior)
-
     def _of_held_points(self) -> Information:
         """The quadratic of the only camera with its bends, without the points: they stay as given."""
         (sight,) = self.sights()
         return of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
-
-    def _in_offsets(self, info: Information) -> Information:
-        """The quadratic around the current target, in the whole offsets along each point's axes."""
-        return info.turned(self.prior.axes).around_given(self.offsets)
 
     def _by_fold(self, sights: Sequence[Sight], offsets: Array) -> list[WithoutPoses]:
         """The quadratic in the whole offsets of each fold of the views, at a target with these offsets."""

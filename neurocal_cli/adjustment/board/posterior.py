@@ -55,15 +55,6 @@ class Posterior:
     evidence: float  # log evidence, with a flat prior on the cameras' normalised parameters
     # The covariance of cameras, offsets and poses and the gauge; None if the points stay as given.
     joint: tuple[Callable[[], JointCovariance], Gauge] | None = None
-    # Camera and joint covariance with stretch and lean as far as noise may hide them; None if they are that.
-    with_open: Callable[[], tuple[Array, Callable[[], JointCovariance]]] | None = None
-
-    def opened(self) -> Posterior:
-        """The same with a covariance that contains stretch and lean as far as noise may hide them."""
-        if self.joint is None or self.with_open is None:
-            return self
-        camera, joint = self.with_open()
-        return replace(self, camera=camera, joint=(joint, self.joint[1]), with_open=None)
 
     @property
     def followed(self) -> Array:
@@ -226,11 +217,14 @@ def given_posterior(info: Information, prior: Prior) -> Posterior:
 def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
     """The posterior for known sizes and a known noise variance.
 
-    For surveyed points the std keeps the given variance, because their stated sizes do not follow the
-    residuals. Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
+    The covariance contains stretch and lean as far as noise may hide them. For surveyed points the std keeps
+    the given variance, because their stated sizes do not follow the residuals. Raises
+    `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     climb = _Climb(info, prior, system_of(info, prior))
-    found = climb.posterior(climb.at(prior.as_array(sizes) / math.sqrt(variance))).opened()
+    now = climb.at(prior.as_array(sizes) / math.sqrt(variance))
+    found, wider = climb.posterior(now), climb.with_open(now).solved
+    found = replace(found, camera=wider.camera, joint=(wider.joint, climb.gauge))
     return found if prior.stated is None else replace(found, variance=variance)
 
 
@@ -428,11 +422,6 @@ class _Climb:
     def posterior(self, now: _Solution) -> Posterior:
         """The posterior for the sizes of a solution."""
         solved, noise = now.solved, math.sqrt(now.variance)
-
-        def with_open() -> tuple[Array, Callable[[], JointCovariance]]:
-            wider = self.with_open(now).solved
-            return wider.camera, wider.joint
-
         return Posterior(
             offsets=solved.offsets(),
             variance=now.variance,
@@ -442,5 +431,4 @@ class _Climb:
             determined=float(solved.parts().determined.sum()),
             evidence=now.evidence,
             joint=(solved.joint, self.gauge),
-            with_open=with_open,
         )

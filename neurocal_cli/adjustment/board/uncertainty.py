@@ -9,9 +9,7 @@ information.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +21,7 @@ from neurocal_cli.adjustment.board.information import (
     information_of,
     joined,
 )
-from neurocal_cli.adjustment.board.posterior import Posterior, camera_step_of, posterior_of
+from neurocal_cli.adjustment.board.posterior import camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.board.system import WithoutPoses
@@ -41,16 +39,10 @@ from neurocal_cli.observations.target import N_SHAPES, Target, surface_of
 _MOST_POSES = 40
 
 
-def covariance_basis(
-    target: Target,
-    m: Minimum,
-    points: Correspondences,
-    posterior: Callable[[float], Posterior] | None = None,
-) -> CovarianceBasis:
+def covariance_basis(target: Target, m: Minimum, points: Correspondences) -> CovarianceBasis:
     """Input of the covariance of a camera at its minimum, for an estimated target; see `CameraSeen`.
 
-    For a variance of the noise [px^2], `posterior` returns that of the target at this minimum; without it,
-    that is computed here. Raises `numpy.linalg.LinAlgError` if the points do not determine the camera.
+    Raises `numpy.linalg.LinAlgError` if the points do not determine the camera.
     """
     views, label = m.views, target.rows_of(target.straightened(points).world)
     label = label if views.order is None else label[views.order]
@@ -67,10 +59,11 @@ def covariance_basis(
         """The quadratic in the whole offsets."""
         return info.turned(prior.axes).around_given(offsets)
 
+    info = in_offsets(information_of([sight], n))
     if prior.stated is None:
         variance = m.variance(views.n_equations - bent) * views.pixel_scale**2
     else:
-        variance = noise_variance(in_offsets(information_of([sight], n)), prior, target.sizes["stated"])
+        variance = noise_variance(info, prior, target.sizes["stated"])
 
     def moves_without(group: NDArray[np.intp]) -> Array | None:
         n_poses = int(group.max()) + 1
@@ -89,9 +82,7 @@ def covariance_basis(
         except np.linalg.LinAlgError:
             return None
 
-    if posterior is None:
-        posterior = partial(posterior_of, target, in_offsets(information_of([sight], n)), prior)
-    found = posterior(variance)
+    found = posterior_of(target, info, prior, variance)
     normal = _efficient(sight, np.einsum("fni,nji->fnj", found.followed, prior.axes))
     if target.bends is not None:
         normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
