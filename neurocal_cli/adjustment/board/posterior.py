@@ -29,13 +29,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.board.information import Information
 from neurocal_cli.adjustment.board.prior import LEAN, NOTHING, STATED, STRETCH, Gauge, Prior
-from neurocal_cli.adjustment.board.system import (
-    JointCovariance,
-    PointsFirst,
-    PosesFirst,
-    Solved,
-    system_of,
-)
+from neurocal_cli.adjustment.board.system import JointCovariance, Solved, System, system_of
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -237,9 +231,7 @@ def posterior_of(target: Target, info: Information, prior: Prior, variance: floa
     return known_sizes(info, prior, target.sizes, variance)
 
 
-def minimum_of(
-    system: PosesFirst | PointsFirst, sizes: Mapping[str, float], variance: float
-) -> tuple[Array, Array]:
+def minimum_of(system: System, sizes: Mapping[str, float], variance: float) -> tuple[Array, Array]:
     """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances."""
     noise = math.sqrt(variance)
     solved = system.solve({name: size / noise for name, size in sizes.items()})
@@ -288,7 +280,7 @@ class _Climb:
         self,
         info: Information,
         prior: Prior,
-        system: PosesFirst | PointsFirst,
+        system: System,
         absent: Collection[str] = (),
         least_gain: float = _NO_GAIN,
     ) -> None:

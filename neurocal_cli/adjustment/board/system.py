@@ -3,9 +3,9 @@
 The Schur complement eliminates the poses or the points block by block, and the remaining system is dense. So
 the work grows linearly with the number of views or of points.
 
-- `PosesFirst` leaves the cameras and the whole offsets (`WithoutPoses`). Their coordinates are those in which
-  the prior is diagonal whatever its sizes, so that a change of the sizes changes only the matrix's diagonal.
-- `PointsFirst` leaves the cameras, the poses and the coefficients of the smooth parts.
+- Without the poses, the cameras and the whole offsets are left (`WithoutPoses`). Their coordinates are those
+  in which the prior is diagonal whatever its sizes, so that other sizes change only the matrix's diagonal.
+- Without the points, the cameras, the poses and the coefficients of the smooth parts are left.
 """
 
 from __future__ import annotations
@@ -138,142 +138,124 @@ class JointCovariance:
         )
 
 
-def system_of(info: Information, prior: Prior) -> PosesFirst | PointsFirst:
-    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster."""
-    if points_first(info.cameras.cross[..., -1].size, prior):
-        return PointsFirst(info, prior)
-    whole = WithoutPoses(info)
-    return PosesFirst(info, prior, whole.matrix, whole.logdet)
-
-
 def points_first(of_poses: int, prior: Prior) -> bool:
     """Whether it is faster to eliminate the points than the poses, which have this number of unknowns."""
     n, _, m = prior.basis.shape
     return 3 * n > _AS_FAST * (m + of_poses)
 
 
-class PosesFirst:
-    """The system with the poses eliminated: cameras and independent coordinates of the offsets.
+@frozen_dataclass(eq=False)
+class System:
+    """The quadratic in the cameras, coordinates of the offsets and single points, with their prior.
 
-    `matrix` and `of_poses` are the matrix and the log determinant of `WithoutPoses`.
-    Everything independent of the sizes is computed once.
+    Everything independent of the sizes is computed once. The single points are eliminated at each solution;
+    if the poses were eliminated before, there are none, and all offsets follow from the coordinates.
     """
 
-    def __init__(self, info: Information, prior: Prior, matrix: Array, of_poses: float) -> None:
-        self.info, self.coordinates, self.f = info, coordinates_of(prior), len(info.cameras.shared) - 1
-        self.of_poses = of_poses
-        M = self._by_coordinates(self._by_coordinates(matrix).T)
-        hold_untold(M, self.f)
-        self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
-
-    def _by_coordinates(self, rows: Array) -> Array:
-        """Rows by cameras, coordinates and right side, instead of by cameras, offsets and right side."""
-        f = self.f
-        return np.concatenate([rows[:f], self.coordinates.of_rows(rows[f:-1]), rows[-1:]])
+    info: Information
+    prior: Prior
+    units: Array  # (m + 3 s, G) prior variances of m coordinates and s single points for parts of size 1
+    offsets: Callable[[Array], Array]  # (..., n, 3) whole offsets of these (..., m + 3 s)
+    # Matrix of the cameras, the coordinates and the poses, if these are left, before points are eliminated;
+    # bordered by the right side and the cost.
+    bordered: Array
+    by_point: Array  # (s, 3, ...) coupling of each single point to all of them and to the right side
+    of_poses: float = 0.0  # log determinant of the poses' part, if they are eliminated
 
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
-        f, coordinates = self.f, self.coordinates
-        variances = coordinates.variances(ratios)
-        root, logdet = _root_of_inverse(self.matrix + np.diag(np.append(np.zeros(f), 1.0 / variances)))
-        half, camera, own = root @ self.right, root[:, :f], root[:, f:]
-        x = half @ root
-
-        def parts() -> Parts:
-            prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
-            found = np.einsum("ij,ij->j", own, own)
-            return Parts.of(prior, x[f:], found, lambda factors: _squared(own @ factors))
-
-        return Solved(
-            x[:f], lambda: coordinates.offsets(x[f:]), self.given_cost - float(half @ half),
-            logdet + self.of_poses + float(np.log(variances).sum()),
-            cache(parts), camera.T @ camera, cache(lambda: self._joint(root)),
-        )  # fmt: skip
-
-    def _joint(self, root: Array) -> JointCovariance:
-        n = len(self.coordinates.prior.axes)
-        offsets = self.coordinates.offsets(root[:, self.f :]).reshape(len(root), 3 * n)
-        return JointCovariance(root[:, : self.f], offsets, np.zeros((n, 3, 3)), self.info)
-
-
-class PointsFirst:
-    """The system with the points eliminated: cameras, coefficients of the smooth parts and poses.
-
-    Everything independent of the sizes is computed once. `s` is the number of camera parameters and
-    smooth coefficients.
-    """
-
-    def __init__(self, info: Information, prior: Prior) -> None:
-        self.info, self.prior = info, prior
-        self.n, (self.P, self.p) = len(info.point), info.pose_point.shape[:2]
-        self.f, self.m = len(info.cameras.shared) - 1, prior.basis.shape[2]
-        self.s = self.f + self.m
-        basis, shared, cross = prior.basis, info.cameras.shared, info.cameras.cross
-        by_basis = info.point @ basis  # (n, 3, m)
-        flat = basis.reshape(3 * self.n, self.m)
-        across = info.by_camera.reshape(3 * self.n, self.f + 1).T @ flat
-        inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
-        pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
-        # The matrix of cameras, smooth parts and poses before points are eliminated, bordered by the right
-        # side and the cost.
-        s, dim = self.s, self.s + self.p * self.P
-        M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = np.block([[shared[:-1, :-1], across[:-1]], [across[:-1].T, inner]])
-        M[s:dim, : self.f], M[s:dim, self.f : s] = cross[:, :, :-1].reshape(dim - s, self.f), pose_basis
-        M[:s, s:dim] = M[s:dim, :s].T
-        at = s + self.p * np.arange(self.P)
-        for i, j in product(range(self.p), repeat=2):
-            M[at + i, at + j] = info.cameras.own[:, i, j]
-        M[: self.f, -1], M[self.f : s, -1] = shared[:-1, -1], across[-1]
-        M[s:dim, -1], M[-1, -1] = cross[:, :, -1].reshape(-1), info.cost
-        M[-1, :dim] = M[:dim, -1]
-        hold_untold(M, self.f)
-        self.bordered = M
-        # (n, 3, s + P p + 1): coupling of each point to all other unknowns and to the right side
-        poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
-        by_camera, right = info.by_camera[..., :-1], info.by_camera[..., -1:]
-        self.by_point = np.concatenate([by_camera, by_basis, poses, right], axis=2)
-
-    def solve(self, ratios: Mapping[str, float]) -> Solved:
-        """Solve for given sizes of the parts, in units of the noise's standard deviation."""
-        f, s, n = self.f, self.s, self.n
-        of_smooth, of_single = self.prior.variances(ratios)
-        own_root = np.linalg.inv(np.linalg.cholesky(self.info.point + np.eye(3) / of_single[:, :, None]))
+        f, n, width = len(self.info.cameras.shared) - 1, len(self.by_point), len(self.bordered)
+        prior = self.units * self.prior.as_array(ratios) ** 2
+        variances = prior.sum(axis=1)
+        s = f + len(variances) - 3 * n
+        of_single = variances[s - f :].reshape(n, 3)
+        own_root = np.linalg.inv(np.linalg.cholesky(self.info.point[:n] + np.eye(3) / of_single[:, :, None]))
         rows = own_root @ self.by_point
-        flat = rows.reshape(3 * n, -1)
+        flat = rows.reshape(3 * n, width)
         M, at = self.bordered - flat.T @ flat, np.arange(f, s)
-        M[at, at] += 1.0 / of_smooth
+        M[at, at] += 1.0 / variances[: s - f]
         root, of_rest = _root_of_inverse(M[:-1, :-1])
         of_points = -2 * np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum()
-        logdet = float(of_rest + of_points + np.log(of_smooth).sum() + np.log(of_single).sum())
         half = root @ M[:-1, -1]
         x, back = half @ root, np.swapaxes(own_root, 1, 2)
+        own, camera = back @ own_root, root[:, :f]
         # Back-substitution of the points: their response to all other unknowns.
         e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
-        camera, smooth, own = root[:, :f], root[:, f:s], back @ own_root
-        single = cache(lambda: root @ -(back @ rows[:, :, :-1]).reshape(3 * n, len(x)).T)
+        found = np.concatenate([x[f:s], e.ravel()])
+
+        @cache
+        def free() -> Array:
+            single = -(back @ rows[:, :, :-1]).reshape(3 * n, width - 1)
+            return np.concatenate([root[:, f:s], root @ single.T], axis=1)
 
         def joint() -> JointCovariance:
-            offsets = single() + smooth @ self.prior.basis.reshape(3 * n, -1).T
-            return JointCovariance(camera, offsets, own, self.info)
+            of_all = np.zeros((len(self.info.point), 3, 3))
+            of_all[:n] = own
+            return JointCovariance(camera, self.offsets(free()).reshape(len(root), -1), of_all, self.info)
 
         def parts() -> Parts:
-            free = np.concatenate([smooth, single()], axis=1)
-            variances = np.einsum("ij,ij->j", free, free)
-            variances[s - f :] += np.diagonal(own, axis1=1, axis2=2).ravel()
+            spread = np.einsum("ij,ij->j", free(), free())
+            spread[s - f :] += np.diagonal(own, axis1=1, axis2=2).ravel()
 
             def covariance(factors: Array) -> Array:
-                of_points = factors[s - f :].reshape(n, 3, -1)
+                of_points = factors[s - f :].reshape(n, 3, factors.shape[1])
                 by_points = np.tensordot(of_points, own @ of_points, axes=((0, 1), (0, 1)))
-                return _squared(free @ factors) + by_points
+                return _squared(free() @ factors) + by_points
 
-            prior = self.prior.units * self.prior.as_array(ratios) ** 2
-            return Parts.of(prior, np.concatenate([x[f:s], e.ravel()]), variances, covariance)
+            return Parts.of(prior, found, spread, covariance)
 
         return Solved(
-            x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet,
-            cache(parts), camera.T @ camera, joint,
+            x[:f], lambda: self.offsets(found), float(M[-1, -1] - half @ half),
+            float(of_rest + of_points + np.log(variances).sum()) + self.of_poses,
+            cache(parts), camera.T @ camera, cache(joint),
         )  # fmt: skip
+
+
+def system_of(info: Information, prior: Prior) -> System:
+    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster."""
+    if points_first(info.cameras.cross[..., -1].size, prior):
+        return with_single_points(info, prior)
+    coordinates, f, whole = coordinates_of(prior), len(info.cameras.shared) - 1, WithoutPoses(info)
+
+    def by_coordinates(rows: Array) -> Array:
+        """Rows by cameras, coordinates and right side, instead of by cameras, offsets and right side."""
+        return np.concatenate([rows[:f], coordinates.of_rows(rows[f:-1]), rows[-1:]])
+
+    M = by_coordinates(by_coordinates(whole.matrix).T)
+    hold_untold(M, f)
+    no_points = np.zeros((0, 3, len(M)))
+    return System(info, prior, coordinates.units, coordinates.offsets, M, no_points, whole.logdet)
+
+
+def with_single_points(info: Information, prior: Prior) -> System:
+    """The system of the smooth parts, single points and poses."""
+    n, (P, p) = len(info.point), info.pose_point.shape[:2]
+    f, m = len(info.cameras.shared) - 1, prior.basis.shape[2]
+    basis, shared, cross = prior.basis, info.cameras.shared, info.cameras.cross
+    by_basis = info.point @ basis  # (n, 3, m)
+    flat = basis.reshape(3 * n, m)
+    across = info.by_camera.reshape(3 * n, f + 1).T @ flat
+    inner = flat.T @ by_basis.reshape(3 * n, m)
+    s, dim = f + m, f + m + p * P
+    M = np.zeros((dim + 1, dim + 1))
+    M[:s, :s] = np.block([[shared[:-1, :-1], across[:-1]], [across[:-1].T, inner]])
+    M[s:dim, :f] = cross[:, :, :-1].reshape(dim - s, f)
+    M[s:dim, f:s] = info.pose_point.reshape(dim - s, 3 * n) @ flat
+    M[:s, s:dim] = M[s:dim, :s].T
+    at = s + p * np.arange(P)
+    for i, j in product(range(p), repeat=2):
+        M[at + i, at + j] = info.cameras.own[:, i, j]
+    M[:f, -1], M[f:s, -1] = shared[:-1, -1], across[-1]
+    M[s:dim, -1], M[-1, -1] = cross[:, :, -1].reshape(-1), info.cost
+    M[-1, :dim] = M[:dim, -1]
+    hold_untold(M, f)
+    poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, p * P, 3).swapaxes(1, 2)
+    by_point = [info.by_camera[..., :-1], by_basis, poses, info.by_camera[..., -1:]]
+
+    def offsets(free: Array) -> Array:
+        return np.asarray((free[..., :m] @ flat.T + free[..., m:]).reshape(*free.shape[:-1], n, 3))
+
+    return System(info, prior, prior.units, offsets, M, np.concatenate(by_point, axis=2))
 
 
 def hold_untold(M: Array, f: int) -> None:

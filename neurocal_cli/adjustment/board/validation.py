@@ -34,7 +34,12 @@ from neurocal_cli.adjustment.board.information import (
 )
 from neurocal_cli.adjustment.board.posterior import camera_step, camera_step_of, log_evidence, minimum_of
 from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
-from neurocal_cli.adjustment.board.system import PointsFirst, WithoutPoses, hold_untold, points_first
+from neurocal_cli.adjustment.board.system import (
+    WithoutPoses,
+    hold_untold,
+    points_first,
+    with_single_points,
+)
 from neurocal_cli.adjustment.cross_validation import least_by_precision
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.camera.geometry import Array
@@ -194,7 +199,7 @@ def without_each(
     """
     if points_first(sum(part.info.cameras.cross[..., -1].size for part in parts), prior):
         rest = ([part.info for part in parts if part is not out] for out in parts)
-        return [minimum_of(PointsFirst(joined(some), prior), sizes, variance) for some in rest]
+        return [minimum_of(with_single_points(joined(some), prior), sizes, variance) for some in rest]
     f, whole = len(parts[0].info.cameras.shared) - 1, np.asarray(sum(part.matrix for part in parts))
     whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
     estimated = []
