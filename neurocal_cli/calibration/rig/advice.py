@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target, refuse_count
 from neurocal_cli.calibration.rig.adjust import RigFit
+from neurocal_cli.calibration.rig.covariance import covariance_by_points
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.space_uncertainty import by_motion, fitted, pixel_moves, shared_covariance
+from neurocal_cli.calibration.rig.space_uncertainty import by_motion, fitted, pixel_moves
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import InputError
@@ -61,7 +62,7 @@ def advise_rig(rig: Rig, count: int = 3) -> RigAdvice:
     if any(camera.image_size is None for camera in rig.cameras.values()):
         raise InputError("the size of the images is unknown; calibrate with --image-size W H")
     fit = fitted(rig)
-    names, covariance = list(rig.cameras), shared_covariance(fit)
+    names, covariance = list(rig.cameras), covariance_by_points(fit).shared
     pairs = [_Pair(rig, fit, names.index(a), names.index(b)) for a, b in rig.edges]
     views: list[TyingView] = []
     weakest = max(pairs, key=lambda pair: pair.share(covariance))

@@ -31,6 +31,7 @@ from neurocal_cli.adjustment.board.prior import Prior, prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
 from neurocal_cli.adjustment.normal_equations import Covariance, solve_scaled
+from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.adjustment.open_choices import (
     open_at_points,
     opened,
@@ -39,11 +40,49 @@ from neurocal_cli.adjustment.open_choices import (
     with_stretch,
 )
 from neurocal_cli.adjustment.reprojection import stretched_blocks
-from neurocal_cli.calibration.rig.adjust import RigFit, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.target import Target
 
 _LEAST_FRAMES = 3  # fewest for a jackknife; with two, the covariance is multiplied by the scatter
+
+
+def covariance_of(fit: RigFit, target_kept: bool = False) -> tuple[Covariance, float]:
+    """Covariance of all shared unknowns, 0 for those that were not moved, and of the frames' poses.
+
+    It is not smaller than that of frames that contradict each other, or than that with the uncertain target.
+    Further unknowns, which the choice of lenses and target leaves open, come after the others. The second
+    result is the probability that the print is stretched, if the given target was kept.
+    """
+    found = with_choice(covariance_by_points(fit), fit)
+    kept = target_kept or any(camera.target_stretched for camera in fit.problem.calibrations)
+    return with_stretch_of(found, fit) if kept else (found, 0.0)
+
+
+def covariance_by_points(fit: RigFit) -> Covariance:
+    """The same without what choices leave open, on which pixels of points in space hardly depend.
+
+    Points that do not determine the unknowns are an error.
+    """
+    free, problem = np.flatnonzero(fit.free), fit.problem
+    found = fit.normal.only(free).covariance(fit.variance)
+    if not found.smallest > SINGULAR:
+        raise DegenerateGeometryError(
+            "the points do not determine the rig and its cameras (the normal matrix is singular); "
+            "spread them in depth, or give known parameters (--no-skew, or known cameras)"
+        )
+    estimated = problem.estimated_shared
+    least = None if problem.target is None else with_target_uncertainty(problem.target, fit)
+    if is_significant(*scatter(fit)) or (fit.free != estimated).any():
+        # That of all unknowns that the points determine, also of cameras that were not refined.
+        whole, moved = contradicting_covariance(replace(fit, free=estimated)), fit.free[estimated]
+        by_frames = whole[np.ix_(moved, moved)]
+        least = by_frames if least is None else not_smaller(by_frames, least)
+    shared = found.shared if least is None else not_smaller(found.shared, least)
+    of_all = covariance_by_given(fit)
+    of_all[np.ix_(free, free)] += shared
+    return replace(found, shared=of_all, follow=fit.normal.follow)
 
 
 def contradicting_covariance(fit: RigFit) -> Array:
@@ -185,7 +224,14 @@ def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:
 
 def covariance_by_given(fit: RigFit) -> Array:
     """(n_shared, n_shared) covariance of all shared unknowns that the given cameras cause, normalised."""
-    problem, columns, free = fit.problem, fit.state.columns, fit.free
+    given = given_covariance(fit)
+    follow = following_given(fit) if given.any() else given
+    return np.asarray(follow @ given @ follow.T)
+
+
+def given_covariance(fit: RigFit) -> Array:
+    """(n_shared, n_shared) covariance of the parameters of given cameras, normalised."""
+    problem, columns = fit.problem, fit.state.columns
     given = np.zeros((columns.n_shared, columns.n_shared))
     for camera, seen, place in zip(problem.calibrations, problem.observations, columns.cameras, strict=True):
         if camera.given_names:
@@ -196,10 +242,13 @@ def covariance_by_given(fit: RigFit) -> Array:
                 camera.given_covariance,
                 seen.views.pixel_scale,
             )
-    if not given.any():
-        return given
-    whole = fit.normal.reduced()[0][:-1, :-1]
-    follow = np.eye(columns.n_shared)
+    return given
+
+
+def following_given(fit: RigFit) -> Array:
+    """(n_shared, n_shared) how all shared unknowns follow errors of those that the fit did not move."""
+    free, whole = fit.free, fit.normal.reduced()[0][:-1, :-1]
+    follow = np.eye(len(free))
     follow[free] = -solve_scaled(whole[np.ix_(free, free)], whole[free])
     follow[np.ix_(free, free)] = 0.0  # the free unknowns themselves have no error of their own here
-    return np.asarray(follow @ given @ follow.T)
+    return follow

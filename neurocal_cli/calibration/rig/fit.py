@@ -13,22 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.covariance import not_smaller
 from neurocal_cli.adjustment.normal_equations import Covariance
-from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, rig_problem, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, rig_problem
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.causes import TAKEN
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, with_agreeing_poses
 from neurocal_cli.calibration.rig.contradictions import LeftOut, told_left_out, without_contradictions
-from neurocal_cli.calibration.rig.covariance import (
-    contradicting_covariance,
-    covariance_by_given,
-    with_choice,
-    with_stretch_of,
-    with_target_uncertainty,
-)
+from neurocal_cli.calibration.rig.covariance import covariance_of
 from neurocal_cli.calibration.rig.edges import (
     Edge,
     connected,
@@ -44,7 +36,6 @@ from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import TOLD
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
-from neurocal_cli.observations.target import Target
 
 _HERE = Pose(np.eye(3), np.zeros(3))
 
@@ -81,15 +72,9 @@ def fit_rig(
     if outliers == "keep" and left_out:
         told = told_left_out(left_out, problem, names)
         raise DegenerateGeometryError(f"{told}; remove them, or use --outliers reject")
-    target = cameras[names[0]].target
-    common = target is not None and all(camera.target is target for camera in cameras.values())
-    if target is not None and common:
+    if (target := fit.problem.target) is not None:
         fit = with_board(fit, target)
-        target = fit.problem.calibrations[0].target
-    found = _covariance(fit, target if common else None)
-    stretched = 0.0
-    if target_kept or any(camera.target_stretched for camera in cameras.values()):
-        found, stretched = with_stretch_of(found, fit)
+    found, stretched = covariance_of(fit, target_kept)
     if target_kept and stretched:
         kept = tuple(replace(camera, target_stretched=stretched) for camera in fit.problem.calibrations)
         fit = replace(fit, problem=replace(fit.problem, calibrations=kept))
@@ -143,32 +128,6 @@ def _refuse_one_place(rig: Rig) -> None:
             f"{pair.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two "
             "different cameras"
         )
-
-
-def _covariance(fit: RigFit, target: Target | None) -> Covariance:
-    """Covariance of all shared unknowns, 0 for those that were not moved, and of the frames' poses.
-
-    It is not smaller than that of frames that contradict each other, or than that with the uncertain target.
-    Points that do not determine the unknowns are an error.
-    """
-    free = np.flatnonzero(fit.free)
-    found = fit.normal.only(free).covariance(fit.variance)
-    if not found.smallest > SINGULAR:
-        raise DegenerateGeometryError(
-            "the points do not determine the rig and its cameras (the normal matrix is singular); "
-            "spread them in depth, or give known parameters (--no-skew, or known cameras)"
-        )
-    estimated = fit.problem.estimated_shared
-    least = None if target is None else with_target_uncertainty(target, fit)
-    if is_significant(*scatter(fit)) or (fit.free != estimated).any():
-        # That of all unknowns that the points determine, also of cameras that were not refined.
-        whole, moved = contradicting_covariance(replace(fit, free=estimated)), fit.free[estimated]
-        by_frames = whole[np.ix_(moved, moved)]
-        least = by_frames if least is None else not_smaller(by_frames, least)
-    shared = found.shared if least is None else not_smaller(found.shared, least)
-    of_all = covariance_by_given(fit)
-    of_all[np.ix_(free, free)] += shared
-    return with_choice(replace(found, shared=of_all, follow=fit.normal.follow), fit)
 
 
 def _assembled(fit: RigFit, names: list[str], covariance: Covariance) -> Rig:

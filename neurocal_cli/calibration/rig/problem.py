@@ -41,6 +41,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, rotation_step
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.state import CameraState
+from neurocal_cli.observations.target import Target
 
 Frames = Sequence[NDArray[np.intp]]
 """Of each camera, the frame (V_c,) of each of its views; views of one moment have one frame."""
@@ -196,6 +197,12 @@ class RigProblem:
     def together(self) -> NDArray[np.bool_]:
         """(V,) frames of several cameras, which have their pose in the first camera of the rig."""
         return self.n_views > 1
+
+    @property
+    def target(self) -> Target | None:
+        """The estimated target, if it is that of all cameras."""
+        target = self.calibrations[0].target
+        return target if all(camera.target is target for camera in self.calibrations) else None
 
     @property
     def estimated(self) -> tuple[NDArray[np.bool_], ...]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import inverse_or_nan
 from neurocal_cli.adjustment.problem import intrinsic_matrix
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, rig_problem, scatter
-from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, rig_problem
+from neurocal_cli.calibration.rig.covariance import covariance_by_points
 from neurocal_cli.calibration.rig.frames import pair_points
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.rig import Rig
@@ -107,17 +107,6 @@ def point_moves(
     return -by_pixel @ right, by_pixel
 
 
-def shared_covariance(fit: RigFit) -> Array:
-    """(n_shared, n_shared) covariance of what the frames share: of the fit, and of given cameras."""
-    free = np.flatnonzero(fit.free)
-    shared = covariance_by_given(fit)
-    if is_significant(*scatter(fit)):
-        shared[np.ix_(free, free)] += contradicting_covariance(fit)
-    else:
-        shared[np.ix_(free, free)] += fit.normal.only(free).covariance(fit.variance).shared
-    return shared
-
-
 def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     """Depths of points that two cameras see, along the rays of the first, and their std for exact pixels.
 
@@ -149,7 +138,7 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     down = (rays @ state.R[first] @ moves)[:, 0]
     if first:
         down[:, state.columns.rigs[first]] += (rays @ in_camera(fit, points, first)[1])[:, 0]
-    variance = np.einsum("ni,ij,nj->n", down, shared_covariance(fit), down)
+    variance = np.einsum("ni,ij,nj->n", down, covariance_by_points(fit).shared, down)
     std[kept] = np.sqrt(np.maximum(variance, 0.0))
     return depth, std
 
@@ -177,7 +166,7 @@ def errors_at(rig: Rig, distance: float) -> PlaneErrors:
     points, seen = points[common], seen[:, common]
     fit = fitted(rig)
     moves, by_pixel = point_moves(fit, points, seen, rig.noise_shares)
-    covariance, variance = shared_covariance(fit), rig.rmse_px**2 / 2
+    covariance, variance = covariance_by_points(fit).shared, rig.rmse_px**2 / 2
 
     def spread(gain: Array, noise: Array) -> Spread:
         """Of some coordinates (k, n_shared) with their covariance (k, k) by pixels of unit variance."""

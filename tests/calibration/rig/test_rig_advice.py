@@ -13,7 +13,8 @@ from support.many_cameras import SIGMA, Points, scene
 
 from neurocal_cli import Pose, Rig, calibrate_rig, write_rig
 from neurocal_cli.calibration.rig.advice import _Pair, advise_rig
-from neurocal_cli.calibration.rig.space_uncertainty import fitted, shared_covariance
+from neurocal_cli.calibration.rig.covariance import covariance_by_points
+from neurocal_cli.calibration.rig.space_uncertainty import fitted
 from neurocal_cli.errors import InputError
 from neurocal_cli.simulation.rigs import SimulatedRig
 
@@ -24,7 +25,7 @@ def made(points: Points) -> Rig:
 
 def std_of(rig: Rig, cameras: tuple[str, str]) -> float:
     fit, names = fitted(rig), list(rig.cameras)
-    pair, covariance = _Pair(rig, fit, *map(names.index, cameras)), shared_covariance(fit)
+    pair, covariance = _Pair(rig, fit, *map(names.index, cameras)), covariance_by_points(fit).shared
     return pair.std(covariance[np.ix_(pair.columns, pair.columns)])
 
 
