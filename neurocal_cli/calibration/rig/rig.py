@@ -219,23 +219,11 @@ class Rig(Presented):
     def _relative_covariance(self, names: tuple[str, str], pose: Pose) -> Array:
         """(6, 6) covariance of the angles and the translation from one camera to another."""
         places = {name: 6 * k + np.arange(6) for k, name in enumerate(list(self.poses)[1:])}
-        # Steps w, tau of a pose follow from its angles and translation.
         J = np.zeros((6, len(self.covariance)))
-        R, turned = pose.R, pose.R @ self.poses[names[0]].t
-        for sign, name in zip((-1, 1), names, strict=True):
-            if name not in places:
-                continue
-            angles, shift = places[name][:3], places[name][3:]
-            turn = np.linalg.pinv(euler_jacobian(self.poses[name].R))
-            if sign > 0:  # exp(w) R_b, t_b + tau
-                J[:3, angles] = turn
-                J[3:, angles] = cross_matrix(turned) @ turn
-                J[3:, shift] = np.eye(3)
-            else:  # R_b R_a^T exp(-w), -R_b R_a^T (t_a + tau)
-                J[:3, angles] = -R @ turn
-                J[3:, angles] = -cross_matrix(turned) @ R @ turn
-                J[3:, shift] = -R
-        J[:3] = euler_jacobian(R) @ J[:3]
+        for name, by in zip(names, relative_steps(*(self.poses[name] for name in names)), strict=True):
+            if name in places:
+                J[:, places[name]] = by @ steps_by_angles(self.poses[name].R)
+        J[:3] = euler_jacobian(pose.R) @ J[:3]
         return np.asarray(J @ self.covariance @ J.T)
 
 
@@ -349,6 +337,22 @@ def of_two(
         covariance,
         {a: {left: a, right: b} for a, b in pairs},
     )
+
+
+def steps_by_angles(R: Array) -> Array:
+    """(6, 6) steps w, tau of a pose (exp(w) R, t + tau), by its angles and translation."""
+    J = np.eye(6)
+    J[:3, :3] = np.linalg.pinv(euler_jacobian(R))
+    return J
+
+
+def relative_steps(first: Pose, second: Pose) -> tuple[Array, Array]:
+    """(6, 6) steps w, tau of the pose R_b R_a^T from a first to a second camera, by those of both poses."""
+    R = second.R @ first.R.T
+    by_first, by_second = np.asarray(-np.kron(np.eye(2), R)), np.asarray(np.eye(6))
+    for by in (by_first, by_second):
+        by[3:, :3] = cross_matrix(R @ first.t) @ by[:3, :3]
+    return by_first, by_second
 
 
 def named_std(covariance: Array, t: Array) -> dict[str, float]:

@@ -1,16 +1,32 @@
-"""Whether the cameras of a rig, or their poses, have changed since an earlier calibration."""
+"""Whether the cameras of a rig, or their poses, have changed since an earlier calibration.
+
+A rig that was calibrated with cameras that were given as another rig has them shares their errors with it:
+those d of their parameters, which its poses y follow as F d, and what the choice of their lenses leaves open,
+by which both are wrong alike. So the covariance of the difference from the poses x of the other rig is that
+of F d - x and of the noise of y.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from neurocal_cli.adjustment.normal_equations import NOTHING
+from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.drift import FEW_VIEWS, SHARE, Drift, find_drift, tail
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig
+from neurocal_cli.calibration.rig.adjust import RigFit
+from neurocal_cli.calibration.rig.covariance import covariance_by_points, following_given, given_covariance
+from neurocal_cli.calibration.rig.fit import fit_rig
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, relative_steps, steps_by_angles
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, has_points
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, euler_jacobian, rotation_vector
-from neurocal_cli.errors import InputError
+from neurocal_cli.camera.geometry import Array, rotation_vector
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError, NeurocalError
+
+Differences = Callable[[str, str], Array]
+"""(6, 6) covariance of the difference of two rigs' poses from one camera to another, as turn and shift."""
 
 
 @frozen_dataclass(eq=False)
@@ -86,19 +102,39 @@ def find_rig_drift(old: Rig, new: Rig) -> RigDrift:
             cameras[name] = find_drift(camera, new.cameras[name])
         except InputError as error:
             raise InputError(f"camera {name}: {error}") from error
+    return _of_poses(old, new, cameras)
+
+
+def moved_since(rig: Rig, seen: Mapping[str, Calibration]) -> RigDrift | None:
+    """Compare the poses of a rig with those that new frames give its cameras, which are as they were.
+
+    None if the frames do not determine the poses, or of fewer than two cameras.
+    """
+    if len(seen) < 2:
+        return None
+    try:
+        return _of_poses(rig, fit_rig({name: seen[name] for name in rig.cameras if name in seen}), {})
+    except NeurocalError:
+        return None
+
+
+def _of_poses(old: Rig, new: Rig, cameras: Mapping[str, Drift]) -> RigDrift:
+    known = differences(old, new)
 
     def seen_from(reference: str) -> RigDrift:
-        others = [name for name in old.cameras if name != reference]
-        poses = {name: find_pose_drift(old, new, name, reference) for name in others}
+        others = [name for name in new.cameras if name != reference]
+        poses = {name: find_pose_drift(old, new, name, reference, known) for name in others}
         return RigDrift(cameras, poses, old.unit, reference)
 
-    found = seen_from(old.first)
+    found = seen_from(new.first)
     if len(found.moved) <= len(found.poses) / 2:
         return found
-    return min((seen_from(name) for name in old.cameras), key=lambda one: len(one.moved) or len(old.cameras))
+    return min((seen_from(name) for name in new.cameras), key=lambda one: len(one.moved) or len(new.cameras))
 
 
-def find_pose_drift(old: Rig, new: Rig, name: str, reference: str | None = None) -> PoseDrift:
+def find_pose_drift(
+    old: Rig, new: Rig, name: str, reference: str | None = None, known: Differences | None = None
+) -> PoseDrift:
     """Compare the pose of a camera in a new calibration of a rig with that in an old one.
 
     The pose is relative to another camera of the rig, by default the first.
@@ -113,16 +149,19 @@ def find_pose_drift(old: Rig, new: Rig, name: str, reference: str | None = None)
     InputError
         The rigs have other first cameras or units, or the standard deviations are unknown.
     """
-    if (old.first, old.unit) != (new.first, new.unit):
+    if old.unit != new.unit or (reference is None and old.first != new.first):
         raise InputError(
             f"the poses are relative to {old.first} in {old.unit} and to {new.first} in {new.unit}; "
             "calibrate both rigs alike"
         )
-    before, after = (rig.pair(reference or old.first, name) for rig in (old, new))
+    reference = reference or old.first
+    before, after = (rig.pair(reference, name) for rig in (old, new))
     difference = np.concatenate([rotation_vector(after.R @ before.R.T), after.t - before.t])
     baseline = after.baseline - before.baseline
-    std = np.sqrt(np.diag(_covariance(before) + _covariance(after)))
-    baseline_std = float(np.hypot(before.std["baseline"], after.std["baseline"]))
+    covariance = (known or differences(old, new))(reference, name)
+    along = np.concatenate([np.zeros(3), after.t / max(after.baseline, NOTHING)])
+    *of_step, of_baseline = np.append(np.diagonal(covariance), along @ covariance @ along).tolist()
+    std, baseline_std = np.sqrt(np.maximum(of_step, 0.0)), float(np.sqrt(max(of_baseline, 0.0)))
     values, stds = np.append(difference, baseline), np.append(std, baseline_std)
     if not np.isfinite(stds).all():
         raise InputError(f"the standard deviations of the pose of {name} are unknown; take more views of it")
@@ -134,6 +173,56 @@ def find_pose_drift(old: Rig, new: Rig, name: str, reference: str | None = None)
 
 def _covariance(pair: StereoRig) -> Array:
     """The (6, 6) covariance of a small turn of R and of t."""
-    J = np.eye(6)
-    J[:3, :3] = np.linalg.pinv(euler_jacobian(pair.R))  # the turn that changes the angles
+    J = steps_by_angles(pair.R)
     return np.asarray(J @ pair.covariance @ J.T)
+
+
+def differences(old: Rig, new: Rig) -> Differences:
+    """The covariances of the differences of two rigs' poses.
+
+    Where a rig was written without its points, what they share is not known, and counts twice.
+    """
+    names = [list(rig.cameras) for rig in (old, new)]
+    alike = [name for name, camera in new.cameras.items() if _is_given(camera, old.cameras.get(name))]
+    if not (alike and has_points(old) and has_points(new)):
+        return lambda *pair: _covariance(old.pair(*pair)) + _covariance(new.pair(*pair))
+    before, after = fitted(old), fitted(new)
+    d = np.zeros((after.state.columns.n_shared, before.state.columns.n_shared))  # as the old rig has them
+    for name in alike:
+        one, other = (own.index(name) for own in names)
+        place, its = after.state.columns.cameras[other], before.state.columns.cameras[one]
+        d[place, its] = 1.0
+        d[place[:5], its[:5]] = before.problem.observations[one].views.pixel_scale
+        d[place[:5], its[:5]] /= after.problem.observations[other].views.pixel_scale
+        if before.state.cameras[one].square:
+            d[place[2], its[[0, 2]]] = d[place[0], its[0]], 0.0
+    follow, given, shared = following_given(after), given_covariance(after), d.any(axis=1)
+    given[:, ~shared] = given[~shared] = 0.0
+    rest = covariance_by_points(after).shared - follow @ given @ follow.T
+    known = covariance_by_points(before).shared
+
+    def between(first: str, second: str) -> Array:
+        sides = [(own.index(first), own.index(second)) for own in names]
+        by_old, by_new = (_steps_of(fit, *pair) for fit, pair in zip((before, after), sides, strict=True))
+        apart = by_new @ follow @ d - by_old
+        return np.asarray(apart @ known @ apart.T + by_new @ rest @ by_new.T)
+
+    return between
+
+
+def _is_given(camera: Calibration, old: Calibration | None) -> bool:
+    """Whether a camera was given, with the parameters that it has in the old rig."""
+    if old is None or not camera.given_names:
+        return False
+    return camera.intrinsics == old.intrinsics and camera.camera.distortion == old.camera.distortion
+
+
+def _steps_of(fit: RigFit, first: int, second: int) -> Array:
+    """(6, n_shared) steps of the pose from one camera to another, by the unknowns of a rig."""
+    state, unit = fit.state, fit.problem.unit
+    by = relative_steps(*(Pose.exact(state.R[side], unit * state.t[side]) for side in (first, second)))
+    whole = np.zeros((6, state.columns.n_shared))
+    for side, own in zip((first, second), by, strict=True):
+        if side:
+            whole[:, state.columns.rigs[side]] = own * np.repeat([1.0, unit], 3)
+    return whole
