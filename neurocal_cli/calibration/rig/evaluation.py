@@ -27,7 +27,7 @@ from neurocal_cli.calibration.rig.frames import (
     pair_views,
     unpaired,
 )
-from neurocal_cli.calibration.rig.given_points import Points, accepted, judged_by_points, other_size
+from neurocal_cli.calibration.rig.given_points import Points, accepted, judged_by_points
 from neurocal_cli.calibration.rig.many_views import triangulate_many
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.rig.space_error import SpaceError, space_error
@@ -342,9 +342,7 @@ class _Pairs:
         """The verdict with the findings about the given points."""
         left, right = self.points.values()
         frames = frames_of_pairs(left.view_names, right.view_names, self.views)
-        otherwise = partial(other_size, rig, self._own_poses(self.new)[1])
-        given = self.points, self.fits, frames, poses
-        return judged_by_points(self._judgement(), rig, *given, otherwise)
+        return judged_by_points(self._judgement(), rig, self.points, self.fits, frames, poses)
 
     def _error(self, poses: list[Pose], rigs: list[Pose], used: Sequence[tuple[str, str]]) -> SpaceError:
         """Triangulate the points of the used views and compare them with the target."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -15,17 +15,18 @@ from neurocal_cli.calibration.evaluation import (
     with_findings,
 )
 from neurocal_cli.calibration.rig.frames import FrameNames
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig
-from neurocal_cli.calibration.verdict.findings import Finding
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.rig_drift import RigDrift, moved_since
+from neurocal_cli.calibration.verdict.findings import Finding, name_some, two_digits
 from neurocal_cli.calibration.verdict.odd_points import units_mixed
-from neurocal_cli.camera.geometry import Array, median, rotation_vector
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.estimated_board import laid
 from neurocal_cli.observations.points import Correspondences
 
-# Given points show a target of another size if the baseline differs by more than this share while the views'
-# relative poses agree with the rig within this angle [rad]; noise turns that of a view by a few thousandths.
+# Given points show a target of another size if all distances of the cameras differ by more than this share,
+# and alike, while their directions and turns agree with the rig within this angle [rad].
 _OTHER_SIZE, _SAME_DIRECTION = 0.05, 0.02
 
 Cameras = Mapping[str, Calibration]
@@ -56,12 +57,10 @@ def judged_by_points(
     fits: Cameras,
     frames: FrameNames,
     poses: Mapping[str, Pose],
-    otherwise: Callable[[int], Iterable[Finding]] = lambda grade: (),
 ) -> Verdict | None:
     """The verdict on a rig with what given points say in frames of which the poses are known.
 
-    `fits` are the cameras with the poses of the given views in each alone, and `otherwise` explains an error
-    of a grade.
+    `fits` are the cameras with the poses of the given views in each alone.
     """
     if verdict is None:
         return None
@@ -72,7 +71,8 @@ def judged_by_points(
     error = given_error(verdict, rig.rmse_px, *given)
     if error[0] and (noise := _noise_of_given(rig.cameras, fits)) is not None:
         error = given_error(verdict, max(rig.rmse_px, noise), *given)
-    findings = [*(otherwise(error[0]) if error[0] else ()), error]
+    drift = moved_since(rig, fits)
+    findings = [error] if drift is None else [*_changed(rig, drift, error[0]), error]
     for name, fit in fits.items():
         findings += [(grade, f"{name} camera: {text}", advice) for grade, text, advice in given_camera(fit)]
     return with_findings(verdict, findings)
@@ -99,24 +99,42 @@ def _noise_of_given(cameras: Cameras, fits: Cameras) -> float | None:
     return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) == len(fits) > 0 else None
 
 
-def other_size(rig: StereoRig, poses: Sequence[Pose], grade: int) -> Iterator[Finding]:
-    """The finding about given points of a target of another size or unit, if that is what is wrong.
-
-    The relative poses of the cameras by the given views then have the rotation and the direction of the rig,
-    but another baseline.
-    """
-    t = np.array([pose.t for pose in poses]).reshape(-1, 3)
-    length = np.linalg.norm(t, axis=1)
-    if not poses or not (length > 0).all():
+def _changed(rig: Rig, drift: RigDrift, grade: int) -> Iterator[Finding]:
+    """What has changed in the rig, or in the target, where the error on the given points has this grade."""
+    if not drift.moved:
         return
-    turned = [np.linalg.norm(rotation_vector(pose.R @ rig.R.T)) for pose in poses]
-    aside = np.arccos(np.clip(t @ rig.t / (length * rig.baseline), -1.0, 1.0))
-    ratio = float(median(length)) / rig.baseline
-    if max(median(np.array(turned)), median(aside)) < _SAME_DIRECTION and abs(np.log(ratio)) > _OTHER_SIZE:
+    before = np.stack([rig.pair(drift.reference, name).t for name in drift.poses])
+    after = before + [pose.shift for pose in drift.poses.values()]
+    length, other = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    aside = np.arccos(np.clip((before * after).sum(axis=1) / (length * other), -1.0, 1.0))
+    turned = [np.linalg.norm(pose.turn) for pose in drift.poses.values()]
+    ratio = float(median(other / length))
+    alike = np.abs(np.log(other / length / ratio)).max() < _OTHER_SIZE
+    if alike and max(*turned, *aside) < _SAME_DIRECTION and abs(np.log(ratio)) > _OTHER_SIZE:
+        lengths, slid = "the baseline is", "a camera slid along the baseline"
+        if len(drift.poses) > 1:
+            lengths, slid = "all distances of the cameras are", "all cameras slid apart"
         yield (
-            grade,
-            f"with the given points the baseline is {ratio:.3g} times that of the rig: X,Y,Z have "
-            f"another unit{units_mixed(ratio)}, the squares another size, or a camera slid along the "
-            "baseline",
+            max(grade, 1),
+            f"with the given points {lengths} {ratio:.3g} times that of the rig: X,Y,Z have another "
+            f"unit{units_mixed(ratio)}, the squares another size, or {slid}",
             "check the unit of X,Y,Z and the size of the squares",
         )
+        return
+    told = (
+        f"{name} by {_size(np.degrees(pose.turn), np.degrees(pose.turn_std), 'degrees')} and "
+        f"{_size(pose.shift, pose.shift_std, drift.unit)}"
+        for name, pose in drift.poses.items()
+        if name in drift.moved
+    )
+    yield (
+        max(grade, 1),
+        f"since the calibration, relative to {drift.reference}, moved {name_some(told)}",
+        "calibrate the rig from the new points",
+    )
+
+
+def _size(step: Array, std: Array, unit: str) -> str:
+    """Length of a step, with its standard deviation."""
+    length, its_std = (two_digits(float(np.linalg.norm(one))) for one in (step, std))
+    return f"{length} {unit} (std {its_std})"

@@ -150,7 +150,8 @@ def test_a_rig_is_evaluated_on_its_own_and_on_new_points() -> None:
     changed = evaluate_rig(rig, turned).verdict
     assert changed is not None
     assert changed.word == "poor"
-    assert "times the" in changed.reasons[0]
-    assert "all cameras as they were" in changed.advice[0]
+    assert "relative to cam0, moved cam2 by" in changed.reasons[0]
+    assert "times the" in changed.reasons[1]
+    assert "all cameras as they were" in changed.advice[1]
     with pytest.raises(InputError, match="no camera 'x'"):
         evaluate_rig(rig, {"x": new["cam0"]})

@@ -67,6 +67,8 @@ def test_two_cameras_predict_what_a_third_sees_in_other_frames(rig: Rig, real_fi
     found = evaluate_rig(rig, others)
     assert sum(count for count, _ in found.predicted.values()) > 500
     assert np.median([error for _, error in found.predicted.values()]) < 4
+    assert found.verdict is not None
+    assert not any("since the calibration" in reason for reason in found.verdict.reasons)
 
 
 def test_a_camera_one_frame_late_is_found(real_files: RealFiles) -> None:

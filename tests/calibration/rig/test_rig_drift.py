@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.many_cameras import SIGMA, moved
+from support.many_cameras import scene as seen_by_many
 from support.rigs import RigScene, random_rig, sides
 
-from neurocal_cli import Pose
+from neurocal_cli import Pose, calibrate, calibrate_rig, evaluate_rig
+from neurocal_cli.calibration.calibrate import CameraOptions, fit_poses
 from neurocal_cli.calibration.drift import SHARE
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.rig import Rig, named_std
-from neurocal_cli.calibration.rig.rig_drift import find_pose_drift, find_rig_drift
+from neurocal_cli.calibration.rig.rig_drift import find_pose_drift, find_rig_drift, moved_since
 from neurocal_cli.errors import InputError
+from neurocal_cli.simulation.rigs import SimulatedRig
 
 
 def again(scene: RigScene, seed: int, kind: str = "verging", n_views: int = 10) -> RigScene:
@@ -85,6 +89,89 @@ def test_rigs_that_cannot_be_compared_are_refused() -> None:
     with pytest.raises(InputError, match="are unknown"):
         find_pose_drift(rig, unknown, "right")
     assert find_pose_drift(rig, rig, "right").share == 1.0
+
+
+def test_cameras_that_both_rigs_were_given_do_not_make_them_different_or_alike() -> None:
+    ratios, shares = [], []
+    for k in range(6):
+        scene = random_rig(np.random.default_rng([k, 5]), "verging", 10)
+        earlier = sides(again(scene, 1000 + k, n_views=5), 0.2, 9 * k)
+        given: list[CameraOptions] = [
+            {"type": 3, "intrinsics": calibrate(one, distortion="none", target="given")} for one in earlier
+        ]
+        old, new = (
+            calibrate_stereo(*sides(one, 0.2, 2 * k + j), *given, target="given", outliers="keep")
+            for j, one in enumerate((scene, again(scene, k)))
+        )
+        found = find_pose_drift(old, new, "right")
+        assert not found.different
+        ratios.append(np.append(found.turn / found.turn_std, found.shift / found.shift_std))
+        # Without the points, it is not known what they share.
+        apart = find_pose_drift(old.lean, new.lean, "right")
+        shares.append(found.shift_std[2] / apart.shift_std[2])
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert max(shares) < 0.3
+
+
+@pytest.fixture(scope="module")
+def line() -> tuple[SimulatedRig, Rig]:
+    truth, points = seen_by_many("line", 4, 16)
+    return truth, calibrate_rig(points, target="given")
+
+
+def judged(line: tuple[SimulatedRig, Rig], truth: SimulatedRig, size: float = 1.0) -> tuple[str, ...]:
+    """The reasons of the verdict by new frames of a rig."""
+    frames = dict(list(seen_by_many("line", 4, 16, 50)[0].frames.items())[:8])
+    points = replace(truth, frames=frames).points(SIGMA, np.random.default_rng(9))
+    verdict = evaluate_rig(
+        line[1], {name: replace(one, world=size * one.world) for name, one in points.items()}
+    ).verdict
+    assert verdict is not None
+    return verdict.reasons
+
+
+@pytest.mark.parametrize(
+    ("name", "degrees", "mm", "told"),
+    [
+        ("cam3", 0.5, 0.0, "relative to cam0, moved cam3 by 0.5"),
+        ("cam0", 2.0, 0.0, "relative to cam1, moved cam0 by 2 degrees"),
+        ("cam1", 0.0, 10.0, "relative to cam0, moved cam1 by 0.0"),
+    ],
+)
+def test_new_frames_name_the_camera_that_was_bumped(
+    line: tuple[SimulatedRig, Rig], name: str, degrees: float, mm: float, told: str
+) -> None:
+    reason = judged(line, moved(line[0], name, degrees, mm))[0]
+    assert reason.startswith(f"since the calibration, {told}")
+    assert reason.count("degrees") == 1
+
+
+def test_new_frames_of_an_unchanged_rig_and_those_of_another_target_accuse_no_camera(
+    line: tuple[SimulatedRig, Rig],
+) -> None:
+    assert not any("since the calibration" in reason for reason in judged(line, line[0]))
+    reasons = judged(line, line[0], 1.2)
+    assert "all distances of the cameras are 1.2 times that of the rig" in reasons[0]
+    assert not any("since the calibration" in reason for reason in reasons)
+
+
+@pytest.mark.slow
+def test_new_frames_of_unchanged_rigs_differ_as_their_std_says() -> None:
+    ratios, accused = [], []
+    for seed in range(30):
+        truth, points = seen_by_many(("line", "star")[seed % 2], 3 + seed % 3, 24, seed)
+        rig = calibrate_rig(points)
+        frames = dict(list(seen_by_many("star", 3 + seed % 3, 24, seed + 50)[0].frames.items())[:14])
+        new = replace(truth, frames=frames).points(SIGMA, np.random.default_rng(seed + 9))
+        found = moved_since(rig, {name: fit_poses(one, rig.cameras[name], 0) for name, one in new.items()})
+        if found is None:  # not all cameras are in these frames
+            continue
+        accused += found.moved
+        for one in found.poses.values():
+            ratios.append(np.append(one.turn / one.turn_std, one.shift / one.shift_std))
+    assert len(ratios) > 50
+    assert not accused
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.15
 
 
 @pytest.mark.slow
