@@ -41,7 +41,7 @@ from neurocal_cli.adjustment.normal_equations import (
     solve_scaled,
     unit_diagonal,
 )
-from neurocal_cli.adjustment.reprojection import stretched_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import DECENTRED
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
@@ -282,7 +282,7 @@ def open_stretch(found: Covariance, m: Minimum, world: Array, variance: float) -
     target that is not flat: in it, a stretched target is other cameras.
     """
     by = stretches(world)
-    normal = stretched_blocks(m.views.batches, m.state, by)
+    normal, _ = normal_blocks(m.views.batches, m.state, by)
     arrow = replace(m, normal=normal, free=np.append(m.free, np.ones(len(by), dtype=bool))).arrow
     return with_stretch(found, np.arange(int(m.free.sum())), arrow, variance)
 

@@ -32,46 +32,35 @@ def free_columns(free: NDArray[np.bool_]) -> NDArray[np.intp]:
     return camera_columns(len(free) - 5)[np.flatnonzero(free)]
 
 
-def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
+def normal_blocks(
+    batches: PointBatches, state: CameraState, stretches: Array | None = None
+) -> tuple[Array, NDArray[np.bool_]]:
     """Normal matrices (V, 12 + K, 12 + K), and which views are sensible (V,).
 
     The matrices are products of derivatives and residuals, summed over each view's points. Their columns are
-    the derivatives by A11, A12, A22, A13, A23, omega (3), tau (3) and K coefficients, and the residual. A
-    view is sensible if all its points have positive depth and lie where the distortion is monotonic.
+    the derivatives by A11, A12, A22, A13, A23, omega (3), tau (3) and K coefficients, and the residual. If
+    there are m unit deformations of the target, `stretches` (m, 3, 3), those by them are before the residual.
+    A view is sensible if all its points have positive depth and lie where the distortion is monotonic.
     """
-    n_batches = len(batches.view)
-    width = _COEFFICIENTS + len(coefficient_names(state.model)) + 1
+    n_batches, plain = len(batches.view), _COEFFICIENTS + len(coefficient_names(state.model)) + 1
+    width = plain if stretches is None else plain + len(stretches)
     by_batch = np.empty((n_batches, width, width))
     sensible = np.empty(n_batches, dtype=bool)
     buffer = batches.memory(width, state.square)
     for chunk in batches.chunks():
         part = buffer[: chunk.stop - chunk.start]
-        sensible[chunk] = derivatives(batches, chunk, state, part[:, :-1])
+        sensible[chunk] = derivatives(batches, chunk, state, part[:, :plain])
+        if stretches is not None:
+            part[:, -2] = part[:, plain - 1]
+            by_tau = part[:, POSE.start + 3 : POSE.stop]
+            turn = np.swapaxes(state.R[batches.view[chunk]], 1, 2)
+            by_local = (turn @ by_tau.reshape(len(part), 3, -1)).reshape(by_tau.shape)
+            displaced = np.swapaxes(stretches @ batches.local[chunk][:, None], 1, 2)
+            put_displaced(by_local, displaced, part[:, plain - 1 : -2])
         products(part, by_batch[chunk])
     if n_batches == batches.n_views:
         return by_batch, sensible
     return batches.sum_by_view(by_batch), np.logical_and.reduceat(sensible, batches.first)
-
-
-def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Array:
-    """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
-
-    These columns are the derivatives by m unit deformations (m, 3, 3) of the target.
-    """
-    width, n, m = 12 + len(state.k), batches.local.shape[2], len(by)
-    by_batch = np.empty((len(batches.view), width + m, width + m))
-    buffer = batches.memory(width + m, state.square)
-    for chunk in batches.chunks():
-        view = batches.view[chunk]
-        part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part[:, :width])
-        part[:, -2] = part[:, width - 1]
-        by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
-        by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
-        displaced = np.swapaxes(by @ batches.local[chunk][:, None], 1, 2)
-        put_displaced(by_local, displaced, part[:, width - 1 : -2])
-        products(part, by_batch[chunk])
-    return batches.sum_by_view(by_batch)
 
 
 def put_displaced(by_point: Array, displaced: Array, out: Array) -> None:

@@ -23,7 +23,7 @@ from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
+from neurocal_cli.camera.geometry import Array, by_motion, cross_matrix, euler_to_rotation, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
@@ -229,7 +229,11 @@ def view_information(
     """
     points = pose.to_camera(world)
     J, P = _derivatives(camera, free, points, square)
-    J, P = J.reshape(-1, J.shape[2]), P.reshape(-1, 6)
+    return without_pose(J.reshape(-1, J.shape[2]), P.reshape(-1, 6))
+
+
+def without_pose(J: Array, P: Array) -> Array:
+    """(f, f) information of rows of derivatives (n, f), with a pose (n, 6) eliminated."""
     C = J.T @ P
     return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T)
 
@@ -269,5 +273,4 @@ def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array, square:
     by_camera, by_point = camera.project_jacobian(points)
     if square:
         by_camera[:, :, 0] += by_camera[:, :, 2]
-    moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
-    return by_camera[:, :, free], by_point @ moved
+    return by_camera[:, :, free], by_point @ by_motion(points)

@@ -96,6 +96,12 @@ def cross_matrix(w: Array) -> Array:
     return K
 
 
+def by_motion(points: Array, unit: Array | float = 1.0) -> Array:
+    """(N, 3, 6) derivatives of points by a turn about the origin and by a shift in a unit, one or (N,)."""
+    shift = np.eye(3) * np.broadcast_to(unit, len(points))[:, None, None]
+    return np.concatenate([-cross_matrix(points), shift], axis=2)
+
+
 def rotation_step(w: Array) -> Array:
     """Rotation by Cayley's formula, ``(I - K/2)^-1 (I + K/2)`` with K the cross matrix of w.
 

@@ -14,13 +14,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target, refuse_count
+from neurocal_cli.calibration.advice import (
+    Candidate,
+    candidates,
+    points_of_target,
+    refuse_count,
+    without_pose,
+)
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.covariance import covariance_by_points
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.space_uncertainty import by_motion, fitted, pixel_moves
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, pixel_moves
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.camera.geometry import Array, by_motion, median
 from neurocal_cli.errors import InputError
 
 _MOST = 0.5  # least share of the target's points that the second camera has to see
@@ -138,11 +144,9 @@ class _Pair:
             points, observed = in_rig[self._shown(which, in_rig)], self.fit.problem.observations[side]
             noise = observed.views.pixel_scale / np.sqrt(observed.weight)
             by_point, by_shared = pixel_moves(self.fit, points, side)
-            both = np.concatenate([by_shared[:, :, self.columns], by_point @ by_motion(points, 1.0)], axis=2)
+            both = np.concatenate([by_shared[:, :, self.columns], by_point @ by_motion(points)], axis=2)
             rows.append(both.reshape(-1, both.shape[2]) / noise)
-        J, P = np.split(np.concatenate(rows), [len(self.columns)], axis=1)
-        C = J.T @ P
-        return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T) / self.fit.variance
+        return without_pose(*np.split(np.concatenate(rows), [len(self.columns)], axis=1)) / self.fit.variance
 
     def _in_rig(self, view: Candidate) -> Array:
         pose = self.poses[0]

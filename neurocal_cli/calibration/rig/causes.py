@@ -19,7 +19,7 @@ from neurocal_cli.adjustment.normal_equations import NOTHING, Arrowhead, solve_s
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.motion import motion_of
-from neurocal_cli.calibration.rig.problem import Motion, RigProblem
+from neurocal_cli.calibration.rig.problem import Motion, RigProblem, steps_through
 from neurocal_cli.calibration.verdict.effects import step
 from neurocal_cli.calibration.verdict.findings import (
     EXPLAINED,
@@ -94,16 +94,10 @@ class RigCause(Cause[Named]):
 
 
 def _pose(fit: RigFit, side: int, motion: Motion | None) -> Array:
-    steps = np.zeros((len(fit.problem.names[side]), 8, 6))
-    steps[:, 2:] = np.eye(6)
     # As the whole camera moves: a step w, tau in units of the rig.
-    camera = fit.problem.camera(fit.state, side)
-    scale = fit.problem.unit / fit.problem.scale[fit.problem.observations[side].view]
-    steps[:, 5:, 3:] = np.eye(3) * scale[:, None, None]
-    x, y, z = camera.t.T
-    zero = np.zeros_like(x)
-    steps[:, 5:, :3] = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), 2, 0)
-    return steps
+    unit = fit.problem.unit / fit.problem.scale[fit.problem.observations[side].view]
+    by_rig, _ = steps_through(np.eye(3), fit.problem.camera(fit.state, side).t, unit)
+    return np.concatenate([np.zeros((len(unit), 2, 6)), by_rig], axis=1)
 
 
 def _focal(fit: RigFit, side: int, motion: Motion | None) -> Array:

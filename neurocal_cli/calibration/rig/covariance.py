@@ -39,7 +39,6 @@ from neurocal_cli.adjustment.open_choices import (
     stretches,
     with_stretch,
 )
-from neurocal_cli.adjustment.reprojection import stretched_blocks
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
@@ -212,10 +211,7 @@ def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:
         return found, 0.0
     estimated, n = np.flatnonzero(fit.problem.estimated_shared), fit.state.columns.n_shared
     by = stretches(world)
-    blocks = [
-        stretched_blocks(observed.views.batches, fit.problem.camera(fit.state, side), by)
-        for side, observed in enumerate(fit.problem.observations)
-    ]
+    blocks = [normal for normal, _ in fit.problem.blocks(fit.state, by)]
     arrow = fit.problem.gathered(fit.problem.view_equations(fit.state, blocks))
     return with_stretch(
         found, estimated, arrow.only(np.append(estimated, n + np.arange(len(by)))), fit.variance

@@ -38,7 +38,7 @@ from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix, rotation_step
+from neurocal_cli.camera.geometry import Array, by_motion, rotation_step
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.target import Target
@@ -136,12 +136,6 @@ class Observations:
     views: Views  # its views, with the world coordinates normalised as those of their frames
     view: NDArray[np.intp]  # (V_c,) frame of each of its views
     weight: float  # of a squared normalised residual, (S1 / sigma)^2, so that residuals are whitened
-
-    def in_pixels(self, entries: Array) -> Array:
-        """(5,) entries of A [px] from normalised ones."""
-        entries = entries * self.views.pixel_scale
-        entries[3:] += self.views.pixel_centre
-        return entries
 
 
 @frozen_dataclass(eq=False)
@@ -366,10 +360,12 @@ class RigProblem:
             shared[place[:, None], place] += rows.T @ rows
         return replace(normal, shared=shared)
 
-    def blocks(self, state: RigState) -> list[tuple[Array, NDArray[np.bool_]]]:
+    def blocks(
+        self, state: RigState, stretches: Array | None = None
+    ) -> list[tuple[Array, NDArray[np.bool_]]]:
         """`normal_blocks` of each camera."""
         return [
-            normal_blocks(observed.views.batches, self.camera(state, side))
+            normal_blocks(observed.views.batches, self.camera(state, side), stretches)
             for side, observed in enumerate(self.observations)
         ]
 
@@ -444,7 +440,6 @@ def steps_through(R: Array, centre: Array, unit: Array) -> tuple[Array, Array]:
     """
     by_rig, by_pose = np.zeros((len(unit), 6, 6)), np.zeros((*R.shape[:-2], 6, 6))
     by_rig[:, :3, :3] = np.eye(3)
-    by_rig[:, 3:, :3] = -cross_matrix(centre)
-    by_rig[:, 3:, 3:] = np.eye(3) * unit[:, None, None]
+    by_rig[:, 3:] = by_motion(centre, unit)
     by_pose[..., :3, :3] = by_pose[..., 3:, 3:] = R
     return by_rig, by_pose

@@ -179,7 +179,9 @@ def intrinsics_of(fit: RigFit, side: int) -> Intrinsics:
     if not estimated.any():
         return given.intrinsics
     estimated[2] |= given.square_pixels
-    entries = fit.problem.observations[side].in_pixels(fit.state.cameras[side].entries[0])
+    views, entries = fit.problem.observations[side].views, fit.state.cameras[side].entries[0].copy()
+    entries *= views.pixel_scale
+    entries[3:] += views.pixel_centre
     A = intrinsic_matrix(np.where(estimated, entries, given.K[ENTRIES]))
     if not estimated[1] and not given.intrinsics.skewed:
         return Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])

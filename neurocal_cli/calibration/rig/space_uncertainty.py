@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import inverse_or_nan
-from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, rig_problem
 from neurocal_cli.calibration.rig.covariance import covariance_by_points
 from neurocal_cli.calibration.rig.frames import pair_points
 from neurocal_cli.calibration.rig.motion import motion_of
+from neurocal_cli.calibration.rig.result import intrinsics_of
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.geometry import Array, cross_matrix
+from neurocal_cli.camera.geometry import Array, by_motion
 from neurocal_cli.camera.measured import PlaneErrors, Spread
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 
 _MOST_POINTS = 400  # most points that are triangulated
@@ -53,9 +53,7 @@ def fitted(rig: Rig) -> RigFit:
 
 def camera_in_pixels(fit: RigFit, side: int) -> Camera:
     """A camera of the rig at its minimum."""
-    state = fit.state.cameras[side]
-    entries = fit.problem.observations[side].in_pixels(state.entries[0])
-    return Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), state.distortion)
+    return Camera(intrinsics_of(fit, side), fit.state.cameras[side].distortion)
 
 
 def in_camera(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
@@ -63,12 +61,6 @@ def in_camera(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
     state, unit = fit.state, fit.problem.unit
     turned = points @ state.R[side].T
     return turned + unit * state.t[side], by_motion(turned, unit)
-
-
-def by_motion(points: Array, unit: float) -> Array:
-    """(N, 3, 6) derivatives of points by a turn about the origin and by a shift in some unit."""
-    shift = np.broadcast_to(unit * np.eye(3), (len(points), 3, 3))
-    return np.concatenate([-cross_matrix(points), shift], axis=2)
 
 
 def pixel_moves(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
