@@ -11,11 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, rig_problem
+from neurocal_cli.calibration.rig.adjust import rig_problem
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.causes import TAKEN
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, with_agreeing_poses
@@ -31,13 +28,10 @@ from neurocal_cli.calibration.rig.edges import (
 from neurocal_cli.calibration.rig.frames import connected_frames
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.refinement import with_board
-from neurocal_cli.calibration.rig.result import RigAssembly
+from neurocal_cli.calibration.rig.result import assembled
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import TOLD
-from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
-
-_HERE = Pose(np.eye(3), np.zeros(3))
 
 
 def fit_rig(
@@ -78,7 +72,7 @@ def fit_rig(
     if target_kept and stretched:
         kept = tuple(replace(camera, target_stretched=stretched) for camera in fit.problem.calibrations)
         fit = replace(fit, problem=replace(fit.problem, calibrations=kept))
-    rig = _assembled(fit, names, found)
+    rig = assembled(fit, names, found)
     if left_out:
         warnings.insert(0, told_left_out(left_out, problem, names))
     rig = replace(
@@ -128,30 +122,3 @@ def _refuse_one_place(rig: Rig) -> None:
             f"{pair.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two "
             "different cameras"
         )
-
-
-def _assembled(fit: RigFit, names: list[str], covariance: Covariance) -> Rig:
-    found = RigAssembly(fit, covariance)
-    cameras = dict(zip(names, found.cameras, strict=True))
-    none = dict.fromkeys((*POSE_NAMES, "baseline"), 0.0)
-    first = next(iter(cameras.values()))
-    return Rig(
-        cameras,
-        dict(zip(names, [_HERE, *found.poses], strict=True)),
-        dict(zip(names, [none, *found.stds], strict=True)),
-        found.covariance,
-        _frames(fit.problem, names),
-        delays=dict(zip(names[1:], found.delays, strict=False)),
-        timed=fit.problem.motion is not None and fit.problem.motion.stated,
-        rmse_px=found.rmse_px,
-        max_px=max(camera.max_px for camera in found.cameras),
-        converged=first.converged,
-        stop_reason=first.stop_reason,
-        iterations=fit.iterations,
-    )
-
-
-def _frames(problem: RigProblem, names: list[str]) -> dict[str, dict[str, str]]:
-    """The views of each frame that several cameras saw, by the name that the first of them gave it."""
-    several = [{names[k]: view for k, view in views.items()} for views in problem.views if len(views) > 1]
-    return {next(iter(views.values())): views for views in several}

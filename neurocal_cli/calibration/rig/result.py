@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
-from neurocal_cli.calibration.rig.rig import named_std
+from neurocal_cli.calibration.rig.rig import Rig, named_std
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
@@ -29,137 +29,136 @@ from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.observations.target import std_of_scale
 
 
-class RigAssembly:
+def assembled(fit: RigFit, names: Sequence[str], found: Covariance) -> Rig:
     """An adjusted rig in pixels and world units.
 
     `found` is the covariance of all shared unknowns, normalised, with further ones after them.
     """
+    problem, state, columns = fit.problem, fit.state, fit.state.columns
+    first = problem.calibrations[0]
+    scale_std = std_of_scale(first.points, first.target)
+    poses = [Pose(R, t * problem.unit) for R, t in zip(state.R[1:], state.t[1:], strict=True)]
+    covariance = _of_poses(fit, found, poses, scale_std)
+    own = [covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(poses))]
+    stds = [named_std(block, pose.t) for block, pose in zip(own, poses, strict=True)]
+    of_points, delays = [], {}
+    for side, observed in enumerate(problem.observations):
+        errors = point_residuals(observed.views, problem.camera(state, side)) * observed.views.pixel_scale
+        of_points.append((errors**2).sum(axis=1))
+    if state.timed:
+        variances = np.diagonal(_shared_block(fit, found, np.concatenate(columns.delays)))
+        known = zip(state.delay[1:].tolist(), np.sqrt(variances).tolist(), strict=True)
+        delays = dict(zip(names[1:], known, strict=True))
+    cameras = [_calibration(fit, found, side, one, scale_std) for side, one in enumerate(of_points)]
+    several = [{names[k]: view for k, view in views.items()} for views in problem.views if len(views) > 1]
+    return Rig(
+        dict(zip(names, cameras, strict=True)),
+        dict(zip(names, [Pose(np.eye(3), np.zeros(3)), *poses], strict=True)),
+        dict(zip(names, [dict.fromkeys((*POSE_NAMES, "baseline"), 0.0), *stds], strict=True)),
+        covariance,
+        {next(iter(views.values())): views for views in several},
+        delays=delays,
+        timed=problem.motion is not None and problem.motion.stated,
+        rmse_px=float(np.sqrt(np.concatenate(of_points).mean())),
+        max_px=max(camera.max_px for camera in cameras),
+        converged=cameras[0].converged,
+        stop_reason=cameras[0].stop_reason,
+        iterations=fit.iterations,
+    )
 
-    def __init__(self, fit: RigFit, found: Covariance) -> None:
-        self.fit, self.problem, self.state, self.columns = fit, fit.problem, fit.state, fit.state.columns
-        first = self.problem.calibrations[0]
-        self.scale_std = std_of_scale(first.points, first.target)
-        self.found = found
-        self.poses = [
-            Pose(R, t * self.problem.unit) for R, t in zip(self.state.R[1:], self.state.t[1:], strict=True)
-        ]
-        self.covariance, self.stds = self._of_poses()
-        self._measure()
 
-    def _measure(self) -> None:
-        """The errors of all points, and the cameras."""
-        problem, sums, largest = self.problem, [], []  # of the squared errors [px^2]
-        for side, observed in enumerate(problem.observations):
-            errors = point_residuals(observed.views, problem.camera(self.state, side))
-            squares = (errors**2).sum(axis=1) * observed.views.pixel_scale**2
-            sums.append(np.add.reduceat(squares, observed.views.first))
-            largest.append(float(squares.max()))
-        n_points = sum(observed.views.counts.sum() for observed in problem.observations)
-        self.rmse_px = float(np.sqrt(sum(part.sum() for part in sums) / n_points))
-        self.cameras = [
-            self._calibration(side, *errors) for side, errors in enumerate(zip(sums, largest, strict=True))
-        ]
+def _of_poses(fit: RigFit, found: Covariance, poses: Sequence[Pose], scale_std: float) -> Array:
+    """Covariance of the angles and translations of all poses but the first."""
+    n = len(poses)
+    J, followed = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+    for k, pose in enumerate(poses):
+        J[k, :3, k, :3] = euler_jacobian(pose.R)
+        J[k, 3:, k, 3:] = np.eye(3) * fit.problem.unit
+        followed[k, 3:] = pose.t  # the scale of the target
+    flat = J.reshape(6 * n, 6 * n)
+    block = flat @ _shared_block(fit, found, np.concatenate(fit.state.columns.rigs)) @ flat.T
+    return np.asarray(block + scale_std**2 * np.outer(followed, followed))
 
-    def _of_poses(self) -> tuple[Array, list[dict[str, float]]]:
-        """Covariance of the angles and translations of all poses; their and the distances' std."""
-        n, unit = len(self.poses), self.problem.unit
-        J, followed = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
-        for k, pose in enumerate(self.poses):
-            J[k, :3, k, :3] = euler_jacobian(pose.R)
-            J[k, 3:, k, 3:] = np.eye(3) * unit
-            followed[k, 3:] = pose.t  # the scale of the target
-        flat = J.reshape(6 * n, 6 * n)
-        block = flat @ self._shared_block(np.concatenate(self.columns.rigs)) @ flat.T
-        block += self.scale_std**2 * np.outer(followed, followed)
-        own = [slice(6 * k, 6 * k + 6) for k in range(n)]
-        return block, [named_std(block[at, at], pose.t) for at, pose in zip(own, self.poses, strict=True)]
 
-    @property
-    def delays(self) -> list[tuple[float, float]]:
-        """Delay of the images of each camera but the first, and its standard deviation; empty if unknown."""
-        if not self.state.timed:
-            return []
-        variances = np.diagonal(self._shared_block(np.concatenate(self.columns.delays)))
-        return list(zip(self.state.delay[1:].tolist(), np.sqrt(variances).tolist(), strict=True))
+def _shared_block(fit: RigFit, found: Covariance, columns: NDArray[np.intp]) -> Array:
+    """Covariance of some of the shared parameters, 0 for given ones."""
+    free = fit.free[columns]
+    return np.where(np.outer(free, free), found.shared[np.ix_(columns, columns)], 0.0)
 
-    def _shared_block(self, columns: NDArray[np.intp]) -> Array:
-        """Covariance of some of the shared parameters, 0 for given ones."""
-        free = self.fit.free[columns]
-        return np.where(np.outer(free, free), self.found.shared[np.ix_(columns, columns)], 0.0)
 
-    def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
-        """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
-        given, counts = self.problem.calibrations[side], self.problem.observations[side].views.counts
-        intrinsics = intrinsics_of(self.fit, side)
-        alone = [camera.stop_reason for camera in self.problem.calibrations if not camera.converged]
-        together = StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS
-        reason = alone[0] if alone else together.value
-        changes: dict[str, Any] = {}
-        if self.fit.free[self.columns.cameras[side]].any():
-            changes = self._intrinsic_changes(side, intrinsics)
-        rms = np.sqrt(sums / counts)
-        R, t = self.problem.world_poses(self.state, side)
-        stds = with_scale(self._pose_stds(side, R), t, self.scale_std)
-        R.setflags(write=False)
-        t.setflags(write=False)
-        views = {
-            name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
-                             int(counts[k]), float(rms[k]))
-            for k, name in enumerate(self.problem.names[side])
-        }  # fmt: skip
-        rmse = float(np.sqrt(sums.sum() / counts.sum()))
-        return replace(
-            given,
-            views=views,
-            rmse_px=rmse,
-            max_px=float(np.sqrt(largest)),
-            converged=reason == StopReason.CONVERGED.value,
-            stop_reason=reason,
-            network=_network(given.network, intrinsics, views, rmse, self.fit.iterations),
-            judgement=None,
-            **changes,
-        )
+def _calibration(fit: RigFit, found: Covariance, side: int, squares: Array, scale_std: float) -> Calibration:
+    """One camera after the common bundle adjustment, with the squared errors of its points [px^2]."""
+    problem, views = fit.problem, fit.problem.observations[side].views
+    given, intrinsics = problem.calibrations[side], intrinsics_of(fit, side)
+    alone = [camera.stop_reason for camera in problem.calibrations if not camera.converged]
+    together = StopReason.CONVERGED if fit.converged else StopReason.MAX_ITERATIONS
+    reason = alone[0] if alone else together.value
+    changes: dict[str, Any] = {}
+    if fit.free[fit.state.columns.cameras[side]].any():
+        changes = _intrinsic_changes(fit, found, side, intrinsics)
+    rms = np.sqrt(np.add.reduceat(squares, views.first) / views.counts)
+    R, t = problem.world_poses(fit.state, side)
+    stds = with_scale(_pose_stds(fit, found, side, R), t, scale_std)
+    R.setflags(write=False)
+    t.setflags(write=False)
+    results = {
+        name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
+                         int(views.counts[k]), float(rms[k]))
+        for k, name in enumerate(views.names)
+    }  # fmt: skip
+    rmse = float(np.sqrt(squares.mean()))
+    return replace(
+        given,
+        views=results,
+        rmse_px=rmse,
+        max_px=float(np.sqrt(squares.max())),
+        converged=reason == StopReason.CONVERGED.value,
+        stop_reason=reason,
+        network=_network(given.network, intrinsics, results, rmse, fit.iterations),
+        judgement=None,
+        **changes,
+    )
 
-    def _intrinsic_changes(self, side: int, intrinsics: Intrinsics) -> dict[str, Any]:
-        given, camera = self.problem.calibrations[side], self.state.cameras[side]
-        block, std = parameter_covariance(
-            intrinsics,
-            camera.model,
-            self._shared_block(self.columns.cameras[side]),
-            self.problem.observations[side].views.pixel_scale,
-            given.fixed,
-            given.square_pixels,
-        )
-        names = list(std)
-        free = [k for k, name in enumerate(names) if name not in given.fixed]
-        before: tuple[str, ...] = (told_of_fold(camera.model),)
-        chosen = bool(given.lens_choice)
-        if given.std.keys() >= std.keys():
-            alone = Distortion(camera.model, given.distortion)
-            before += parameter_warnings(given.intrinsics, alone, given.std, chosen)
-        now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
-        return {
-            "intrinsics": intrinsics,
-            "std": std,
-            "distortion": camera.k,
-            "covariance": block[np.ix_(free, free)],
-            "covariance_names": tuple(names[k] for k in free),
-            "warnings": (*now, *(text for text in given.warnings if text not in before)),
-        }
 
-    def _pose_stds(self, side: int, R: Array) -> Array:
-        """Standard deviations of the angles and translations of the views, (V_c, 6)."""
-        view, (of_rig, by_rig, by_pose) = (
-            self.problem.observations[side].view,
-            self.problem.pose_steps(self.state, side),
-        )
-        covariance = by_pose @ self.found.own[view] @ np.swapaxes(by_pose, 1, 2)
-        if of_rig.size:
-            mixed = by_rig @ self.found.cross[view][:, of_rig] @ np.swapaxes(by_pose, 1, 2)
-            covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
-            covariance += by_rig @ self._shared_block(of_rig) @ np.swapaxes(by_rig, 1, 2)
-        centre = (R @ self.problem.centre[view][..., None])[..., 0]
-        return pose_std(R, centre, self.problem.scale[view], covariance)
+def _intrinsic_changes(fit: RigFit, found: Covariance, side: int, intrinsics: Intrinsics) -> dict[str, Any]:
+    given, camera = fit.problem.calibrations[side], fit.state.cameras[side]
+    block, std = parameter_covariance(
+        intrinsics,
+        camera.model,
+        _shared_block(fit, found, fit.state.columns.cameras[side]),
+        fit.problem.observations[side].views.pixel_scale,
+        given.fixed,
+        given.square_pixels,
+    )
+    names = list(std)
+    free = [k for k, name in enumerate(names) if name not in given.fixed]
+    before: tuple[str, ...] = (told_of_fold(camera.model),)
+    chosen = bool(given.lens_choice)
+    if given.std.keys() >= std.keys():
+        alone = Distortion(camera.model, given.distortion)
+        before += parameter_warnings(given.intrinsics, alone, given.std, chosen)
+    now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
+    return {
+        "intrinsics": intrinsics,
+        "std": std,
+        "distortion": camera.k,
+        "covariance": block[np.ix_(free, free)],
+        "covariance_names": tuple(names[k] for k in free),
+        "warnings": (*now, *(text for text in given.warnings if text not in before)),
+    }
+
+
+def _pose_stds(fit: RigFit, found: Covariance, side: int, R: Array) -> Array:
+    """Standard deviations of the angles and translations of the views, (V_c, 6)."""
+    problem, view = fit.problem, fit.problem.observations[side].view
+    of_rig, by_rig, by_pose = problem.pose_steps(fit.state, side)
+    covariance = by_pose @ found.own[view] @ np.swapaxes(by_pose, 1, 2)
+    if of_rig.size:
+        mixed = by_rig @ found.cross[view][:, of_rig] @ np.swapaxes(by_pose, 1, 2)
+        covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
+        covariance += by_rig @ _shared_block(fit, found, of_rig) @ np.swapaxes(by_rig, 1, 2)
+    centre = (R @ problem.centre[view][..., None])[..., 0]
+    return pose_std(R, centre, problem.scale[view], covariance)
 
 
 def non_monotonic_sides(fit: RigFit) -> list[int]:
