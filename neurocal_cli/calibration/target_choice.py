@@ -29,7 +29,6 @@ from neurocal_cli.adjustment.board.find import (
     enough_views,
     find_target,
     gain_over_given,
-    of_all_views,
 )
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.common_noise import reweighted
@@ -224,11 +223,13 @@ def _searched(
     if not _can_tell(solution, choice, None):
         return solution, rejected
     kept = solution.noted(target_kept=choice == "auto")
-    common, few = _found(solution, choice, None), _independent(solution, choice)
-    found = common if choice == "flat" or few is not solution else _with_bends(solution, common)
+    if choice == "auto" and not _tell_independently(solution):
+        return kept, rejected
+    common = _found(solution, choice, None)
+    found = common if choice == "flat" else _with_bends(solution, common)
     if found is not None and choice == "auto":
-        fit, named = (few.problem, few.adjusted), solution.has_named_lens
-        if contradicts_sigma(solution) or has_other_cause([fit], found, named, few.repeated):
+        fit, named = (solution.problem, solution.adjusted), solution.has_named_lens
+        if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated):
             return kept, rejected
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):
@@ -275,18 +276,21 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     return views_suffice([points], known, solution.repeated.n_groups)
 
 
-def _independent(solution: Solution, choice: str) -> Solution:
-    """The solution for one view of each group with the same errors, which look like errors of the target."""
-    if choice != "auto" or not solution.repeated.worth < _WORTH:
-        return solution
-    return of_few_views(solution, solution.repeated.n_groups)
+def _tell_independently(solution: Solution) -> bool:
+    """Whether views with errors of their own, if not all have, show a target of another shape.
+
+    Errors that views share look like errors of the target.
+    """
+    if not solution.repeated.worth < _WORTH:
+        return True
+    few = of_few_views(solution, solution.repeated.n_groups)
+    fits, named = [(few.problem, few.adjusted)], solution.has_named_lens
+    found = find_shape(fits, "auto", None, solution.model_errors is None)
+    return found is not None and not has_other_cause(fits, found, named)
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    few = _independent(solution, choice)
-    found = find_shape([(few.problem, few.adjusted)], choice, known, solution.model_errors is None)
-    fits = [(solution.problem, solution.adjusted)]
-    return found if found is None or few is solution else of_all_views(found, fits, known)
+    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
 
 
 def _fitted_to(

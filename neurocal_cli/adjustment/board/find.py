@@ -115,11 +115,8 @@ def find_target(
     if some is None:
         return None
     found = Search(some, flat, known).result(least_gain, least)
-    return found if found is None or some is fits else of_all_views(found, fits, known)
-
-
-def of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
-    """The same target with other fits, for the given target or a `known` one, adjusted to it."""
+    if found is None or some is fits:
+        return found
     moved = []
     for problem, adjusted in fits:
         points = problem.points if known is None else known.as_given(problem.points)
