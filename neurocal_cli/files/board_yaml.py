@@ -108,10 +108,10 @@ def _board(root: Field) -> Board:
             other = other_board(root)
         if other is not None:
             return other
-        if near := nearest_board(root):
+        if "square" not in root and (near := nearest_board(root)):
             root.refuse("is not the file of a board", near)
     unit = root.get("unit", "mm").text()
-    if "kind" in root:
+    if "planes" not in root and ("kind" in root or "square" in root):
         planes: tuple[Plane, ...] = (_plane(root, alone=True, more=("unit", "distances")),)
     else:
         _only(root, ("unit", "planes", "distances"))

@@ -34,6 +34,15 @@ def test_a_charuco_board_is_a_chessboard_with_markers() -> None:
     assert plane.vertex_ids()[:2] == ("0:0", "1:0")
 
 
+def test_a_board_without_a_kind_is_a_chessboard() -> None:
+    text = "unit: cm\ncols: 8\nrows: 5\nsquare: 3\n"
+    assert (
+        parse_board(text) == parse_board(f"kind: chessboard\n{text}") == Board((Plane("", 8, 5, 3.0),), "cm")
+    )
+    with pytest.raises(FormatError, match="the key 'size' is not known"):
+        parse_board(text + "size: 2\n")
+
+
 def test_a_grid_of_tags_counts_from_the_lower_left_as_kalibr_does() -> None:
     board = parse_board(APRILGRID)
     (plane,) = board.planes
