@@ -16,7 +16,6 @@ from neurocal_cli.adjustment.covariance import (
     pose_std,
     with_scale,
 )
-from neurocal_cli.adjustment.free_networks import seen_from_behind
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.observability import refuse_undetermined
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
@@ -25,7 +24,6 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.given_model import undetermined_coefficients
-from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.network.local_minima import second_poses
@@ -261,27 +259,14 @@ def _lens_warnings(solution: Solution) -> Iterator[str]:
 
 
 def _view_warnings(solution: Solution) -> Iterator[str]:
-    """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
-    points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
+    """Warn of errors that last from view to view, and of points with contradictory units."""
+    n_views, repeated = solution.problem.views.n_views, solution.repeated
     if repeated.n_groups < repeated.n_poses:
         yield (
             "the points' errors last from view to view, as in a video; the "
-            f"{views.n_views} views count as {max(repeated.worth * views.n_views, 1.0):.0f}"
+            f"{n_views} views count as {max(repeated.worth * n_views, 1.0):.0f}"
         )
-    elif not (repeated.none or are_normalised(points.pixels)):
-        yield (
-            f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
-            "views that repeat a pose count as one"
-        )
-    yield from filter(None, [scale_of(points).contradiction])
-    # The camera is right nevertheless.
-    mirrored = seen_from_behind(views, solution.state)
-    if mirrored:
-        more = f" and {len(mirrored) - _NAMED} more" if len(mirrored) > _NAMED else ""
-        yield (
-            f"the target appears mirrored in {', '.join(map(repr, mirrored[:_NAMED]))}{more}, so the poses "
-            "of these views are wrong; check the order of their points"
-        )
+    yield from filter(None, [scale_of(solution.problem.points).contradiction])
 
 
 def _rejection_warnings(rejected: Rejected, kept: int) -> Iterator[str]:

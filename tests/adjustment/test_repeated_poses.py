@@ -89,7 +89,7 @@ def test_frames_do_not_ask_for_coefficients_that_their_poses_do_not() -> None:
     # Of five poses, a fisheye's two coefficients predict as well as k1 and k2.
     assert all(c.distortion_model in ("k1k2", "k1k2p1p2", "plumb_bob", "fisheye") for c in found)
     assert all("40 views show only 5 different poses" in " ".join(c.verdict.reasons) for c in found)
-    assert all("40 views show 5 different poses" in " ".join(c.warnings) for c in found)
+    assert not any("poses" in " ".join(c.warnings) for c in found)  # the verdict says it
 
 
 def test_sixty_frames_of_five_poses(real_files: RealFiles) -> None:

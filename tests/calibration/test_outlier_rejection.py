@@ -145,7 +145,7 @@ def test_a_view_left_out_is_named_with_the_reason() -> None:
     mirrored = mismatched(scene, points, 2, "mirrored", np.random.default_rng(0))
     kept = reject(mirrored)  # its homography is as good as any, only the pose is wrong
     assert kept.n_rejected == 0
-    assert any("mirrored in 'view0002'" in text for text in kept.warnings)
+    assert any("view0002: the target is mirrored" in reason for reason in kept.verdict.reasons)
 
 
 def test_points_of_which_most_are_wrong_are_refused() -> None:

@@ -105,29 +105,38 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     if are_normalised(calibration.points.pixels):  # the other rules are in pixels
         yield from odd_pixels(calibration.points)
         return
-    if evidence.mistake is not None:  # it explains what would be taken for another cause
-        yield 2, evidence.mistake[0], evidence.mistake[1]
     if not calibration.converged:
         named = not calibration.lens_choice and calibration.distortion_model != "none"
         slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
         more = "choose a simpler --distortion, or auto" if slow else "increase --starts"
         yield 2, f"training did not converge: {calibration.stop_reason}", more
     yield from _redundancy(calibration)
-    # A given camera that is wrong explains the errors, so it is reported before them.
-    given = evidence.of_given
-    yield from given
-    errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     if _is_unchecked(calibration, evidence):
         yield 2, *_UNCHECKED
-    # A cause explains the other errors, so it is reported first even if it hardly biases the camera.
-    contest = evidence.contest
-    if contest is not None and _explains(calibration, evidence):
-        for grade, reason, advice in causes(contest, calibration, any(grade for grade, *_ in given)):
-            yield max([grade, *(of_error for of_error, *_ in errors)] if grade else [0]), reason, advice
-    yield from errors
+    if evidence.mistake is not None:  # it explains what would be taken for another cause
+        yield 2, *evidence.mistake
+    else:
+        yield from _causes_or_errors(calibration, evidence)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
+
+
+def _causes_or_errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    """Findings about the causes of errors, or about the errors if no known cause explains them.
+
+    A cause is as grave as the errors, even if it hardly biases the camera.
+    """
+    errors = [finding for finding in _errors(calibration, e) if finding[0]]
+    told, explained = list(e.of_given), False
+    if e.contest is not None and _explains(calibration, e):
+        told += causes(e.contest, calibration, any(grade for grade, *_ in told))
+        explained = any(grade for grade, *_ in told)
+    worst = max((grade for grade, *_ in errors if explained), default=0)
+    for grade, reason, advice in told:
+        yield (max(grade, worst) if grade else 0), reason, advice
+    if not explained:
+        yield from errors
 
 
 def _is_unchecked(calibration: Calibration, e: Evidence) -> bool:
@@ -278,10 +287,8 @@ def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
-    more = "add views in which the target is near, tilted and fills the image"
-    if "alpha_u" not in fixed:
-        share = calibration.relative_std_of_scale
-        yield SHARE.grade(share), f"the std of the focal length is {percent(share)} of its value", more
+    size = calibration.image_size
+    yield from _uncertain(calibration, e)
     off_centre = list(_off_centre(calibration))
     if e.coverage.relief < _SHALLOW and (off_centre or calibration.relative_std_of_scale > SHARE.good):
         yield (
@@ -290,7 +297,6 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "determine the focal length and the centre",
             "use a deeper target, or several views of it from different angles",
         )
-    size = calibration.image_size
     is_middle = size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
     if calibration.type == 2 and is_middle:
         yield (
@@ -298,13 +304,6 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "the given image centre is the middle of the image, from which those of real cameras differ by "
             "tens of pixels; the rotations have that error",
             "give the centre of this camera, or estimate it: --type 1",
-        )
-    if "u0" not in fixed:
-        centre = max(std["u0"], std["v0"])
-        yield (
-            SHARE.grade(centre / A.alpha_u),
-            f"the std of the image centre is {two_digits(centre)} px",
-            more,
         )
     name, times = e.lacking
     told = e.contest is not None and any(one.rival in RICHER_LENSES for one in e.contest.causes)
@@ -314,14 +313,6 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"open, the std of {name} is {times:.2g} times as large",
         "give --distortion auto, whose std include what the points leave open",
     )
-    if e.projection is not None and calibration.type != 3:
-        worst = e.projection.worst
-        diagonal = float(np.hypot(*(size or (np.nan, np.nan))))
-        yield (
-            _PROJECTION.grade(worst / diagonal),
-            f"the std of predicted pixels is up to {two_digits(worst)} px",
-            more,
-        )
     if calibration.type == 3:
         return
     ratio = A.alpha_u / A.alpha_v
@@ -343,6 +334,28 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if calibration.target is not None:
         yield from _print(calibration.target, calibration)
     yield from off_centre
+
+
+def _uncertain(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    """Finding about large standard deviations; all of them ask for the same views."""
+    std, fixed, share = calibration.std, calibration.fixed, calibration.relative_std_of_scale
+    found = []
+    if "alpha_u" not in fixed:
+        found.append((SHARE.grade(share), "the focal length", f"{percent(share)} of its value"))
+    if "u0" not in fixed:
+        centre = max(std["u0"], std["v0"])
+        grade = SHARE.grade(centre / calibration.intrinsics.alpha_u)
+        found.append((grade, "the image centre", f"{two_digits(centre)} px"))
+    if e.projection is not None and calibration.type != 3:
+        worst = e.projection.worst
+        grade = _PROJECTION.grade(worst / image_diagonal(calibration.points))
+        found.append((grade, "predicted pixels", f"up to {two_digits(worst)} px"))
+    if large := [f"of {what} is {much}" for grade, what, much in found if grade]:
+        yield (
+            max(grade for grade, *_ in found),
+            f"the std {', that '.join(large)}",
+            "add views in which the target is near, tilted and fills the image",
+        )
 
 
 def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
