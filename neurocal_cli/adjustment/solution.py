@@ -137,11 +137,6 @@ class Solution:
         return noted
 
     @property
-    def has_named_lens(self) -> bool:
-        """Whether the distortion model was named, not selected or found from straight lines."""
-        return self.model_errors is None and self.straight_lines is None
-
-    @property
     def camera(self) -> Camera:
         """The camera in pixels, without image size and name."""
         return Camera(

@@ -174,41 +174,13 @@ def calibrate(
         if start is not None:
             raise UsageError("start needs one board in each image, but some have several; leave it out")
         return _of_several_boards(points, asked, camera_name, progress)
-    choice = "given" if isinstance(target, Target) else target
-    _check(asked, choice, start)
-    angle = _angle_of(skew, square_pixels, distortion, fix)
-    known_target = target if isinstance(target, Target) else None
-    if known_target is not None and known_target.bends is not None:  # cameras of a rig share the same one
-        known_target = replace(known_target, bends=None)
-    if known_target is not None:
-        points = known_target.applied(points)
-    given = None if intrinsics is None else camera_of(intrinsics)
-    known = None if given is None else given.intrinsics
-    poses = extrinsics
-    if isinstance(poses, Calibration):
-        poses = {name: view.pose for name, view in poses.views.items()}
-    model, way = _lens_of(type, method, distortion, given)
-    options = options_for(
-        trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
-    )
-
-    def stated(with_skew: bool) -> Problem:
-        return problem_for(points, type, image_center, known, poses, with_skew, model, fix, square_pixels)
-
+    _check(asked, start)
+    if isinstance(target, Target):
+        if target.bends is not None:  # cameras of a rig share the same target
+            target = replace(target, bends=None)
+        points, asked = target.applied(points), {**asked, "target": target}
     try:
-        if method != "neuro":
-            from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
-
-            found = calibrate_by(method, stated(angle == "free"), camera_name)
-            unused = _unused(points, f"the method is {method}")
-        else:
-            solution, rejected = _solved(stated, angle, options, outliers, choice, start)
-            if known_target is not None:
-                solution = solution.noted(target=known_target)
-            found = calibration_of(
-                solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
-            )
-            unused = _about_target(found, choice)
+        found = _calibrated(points, asked, start, camera_name, progress)
         _refuse_misfit(found)
     except DegenerateGeometryError as error:
         explained = _explained(error, points, type)
@@ -218,7 +190,50 @@ def calibrate(
     if isinstance(intrinsics, Calibration):
         found = with_given_covariance(found, intrinsics)
     undone = () if intrinsics is None else undistorted_before(points, intrinsics)
-    return replace(found, warnings=(*found.warnings, *unused, *undone), judgement=assess)
+    return replace(found, warnings=(*found.warnings, *undone), judgement=assess)
+
+
+def _calibrated(
+    points: Correspondences,
+    asked: CameraOptions,
+    start: Calibration | None,
+    camera_name: str,
+    progress: Progress | None,
+) -> Calibration:
+    """The calibration that is asked for, of points on the target that is known, if one is."""
+    method, target, poses = asked["method"], asked["target"], asked["extrinsics"]
+    angle = _angle_of(asked)
+    given = None if asked["intrinsics"] is None else camera_of(asked["intrinsics"])
+    if isinstance(poses, Calibration):
+        poses = {name: view.pose for name, view in poses.views.items()}
+    model, way = _lens_of(asked["type"], method, asked["distortion"], given)
+
+    def stated(with_skew: bool) -> Problem:
+        known = None if given is None else given.intrinsics
+        return problem_for(
+            points, asked["type"], asked["image_center"], known, poses, with_skew, model, asked["fix"],
+            asked["square_pixels"],
+        )  # fmt: skip
+
+    if method != "neuro":
+        from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
+
+        found = calibrate_by(method, stated(angle == "free"), camera_name)
+        unused = _unused(points, f"the method is {method}")
+    else:
+        options = options_for(
+            asked["trainer"], asked["starts"], asked["seed"], distortion=way, preferred=asked["preferred"],
+            backprop=asked["backprop"], progress=progress,
+        )  # fmt: skip
+        choice = "given" if isinstance(target, Target) else target
+        solution, rejected = _solved(stated, angle, options, asked["outliers"], choice, start)
+        if isinstance(target, Target):
+            solution = solution.noted(target=target)
+        found = calibration_of(
+            solution, rejected, trainer=asked["trainer"], method=method, seed=asked["seed"], name=camera_name
+        )
+        unused = _about_target(found, choice)
+    return replace(found, warnings=(*found.warnings, *unused))
 
 
 def _of_several_boards(
@@ -236,9 +251,10 @@ def _of_several_boards(
     return replace(found, warnings=(*told, *found.warnings))
 
 
-def _check(asked: CameraOptions, choice: str, start: Calibration | None) -> None:
-    """Refuse options that do not go together; the choice is that of the target."""
+def _check(asked: CameraOptions, start: Calibration | None) -> None:
+    """Refuse options that do not go together."""
     method, trainer, distortion = asked["method"], asked["trainer"], asked["distortion"]
+    choice = asked["target"] if isinstance(asked["target"], str) else "given"
     if asked["starts"] < 2:
         raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     check_seed(asked["seed"])
@@ -276,16 +292,17 @@ def _explained(error: DegenerateGeometryError, points: Correspondences, type: in
     return text
 
 
-def _angle_of(skew: bool | str, square_pixels: bool, distortion: str, fix: Mapping[str, float] | None) -> str:
+def _angle_of(asked: CameraOptions) -> str:
     """Whether the angle of the axes is "free", "fixed", or found to be one of them ("auto")."""
-    if not square_pixels:
+    skew = asked["skew"]
+    if not asked["square_pixels"]:
         angle = "auto" if skew == "auto" else "free" if skew in (True, "free") else "fixed"
-        if fix and "alpha_v" in fix and angle != "fixed":
+        if "alpha_v" in (asked["fix"] or ()) and angle != "fixed":
             raise UsageError(
                 "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
             )
         return angle
-    if distortion == "plumb-line":
+    if asked["distortion"] == "plumb-line":
         raise UsageError("square_pixels does not go with the distortion plumb-line; name k1k2p1p2 instead")
     if skew in ("free", "auto"):
         raise UsageError(f"square pixels have right angles, but skew is {skew}; leave it out")

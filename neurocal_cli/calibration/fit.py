@@ -16,6 +16,7 @@ from neurocal_cli.adjustment.residual_correlation import effective_number
 from neurocal_cli.adjustment.solution import Solution, restarted
 from neurocal_cli.calibration.lens_choice.given_model import (
     DENOMINATOR,
+    Starts,
     check_distortion,
     total_cost,
     with_denominator_if_supported,
@@ -52,14 +53,7 @@ def fit(problem: Problem, options: Options, known: Solution | None = None) -> So
     if problem.free_distortion and problem.distortion.model == "rich":
         return _displaced(fit(problem.with_model("fisheye"), options))
     check_points(problem)
-    first = _first_solution(problem, options)
-    if options.distortion == "auto":
-        return _finished(first, options)
-    solution = with_more_starts(first, partial(_distorted_starts, options=options))
-    # For several views that share a camera, the first solution has tried the mirrored poses already.
-    if solution is not first or problem.type == 3 or problem.views.n_views == 1:
-        solution = _turned(solution)
-    return _finished(solution, options)
+    return _finished(_first_solution(problem, options), options)
 
 
 @quietly
@@ -79,29 +73,34 @@ def fit_again(
 
 
 def _finished(solution: Solution, options: Options, only_from_here: bool = False) -> Solution:
-    """Select the distortion model, and reweight the points as far as the residuals support that."""
-    chosen = options.distortion == "auto"
-    if chosen:
-        solution = _with_selected_model(solution, options, only_from_here)
-    solution = reweighted(solution)
-    if not chosen or solution.problem.points.covariance is not None:  # reweighting may have moved it
+    """Find the lens, and reweight the points as far as the residuals support that."""
+    starts = None if only_from_here else partial(_distorted_starts, options=options)
+    solution = reweighted(_with_lens(solution, starts, options))
+    # A selected lens is checked already, but reweighting may have moved it.
+    if options.distortion != "auto" or solution.problem.points.covariance is not None:
         solution = check_distortion(solution)
     return solution
 
 
-def _with_selected_model(solution: Solution, options: Options, only_from_here: bool) -> Solution:
-    """Select the distortion model, again if mirrored poses fit better with it."""
-    from neurocal_cli.calibration.lens_choice.model_selection import select_model
+def _with_lens(solution: Solution, starts: Starts | None, options: Options) -> Solution:
+    """The lowest minimum of the named lens, or of the one that is selected among all.
 
-    if only_from_here:
-        return select_model(solution, preferred=options.preferred)
-    more_starts = partial(_distorted_starts, options=options)
-    found = select_model(solution, more_starts, options.preferred)
-    turned = _turned(found)
-    if turned is found:
-        return found
-    again = replace(solution, adjusted=turned.adjusted)
-    return select_model(again, more_starts, options.preferred)
+    It is found again if mirrored poses of flat boards fit better with it. Other starts are tried if there are
+    any.
+    """
+
+    def found_from(start: Solution) -> Solution:
+        if options.distortion != "auto":
+            return with_more_starts(start, starts)
+        from neurocal_cli.calibration.lens_choice.model_selection import select_model
+
+        return select_model(start, starts, options.preferred)
+
+    found = found_from(solution)
+    # The first solution of several views that share a camera has tried the mirrored poses already.
+    tried = found is solution and solution.problem.type != 3 and solution.problem.views.n_views > 1
+    turned = found if starts is None or tried else _turned(found)
+    return found if turned is found else found_from(replace(solution, adjusted=turned.adjusted))
 
 
 def _first_solution(problem: Problem, options: Options) -> Solution:

@@ -39,10 +39,7 @@ _OWN_STEPS = 60
 
 
 def has_other_cause(
-    fits: Sequence[tuple[Problem, Adjusted]],
-    found: Found,
-    named_lens: bool,
-    repeated: RepeatedPoses | None = None,
+    fits: Sequence[tuple[Problem, Adjusted]], found: Found, repeated: RepeatedPoses | None = None
 ) -> bool:
     """Whether the errors on the given target have another cause than the shape that was found.
 
@@ -51,8 +48,7 @@ def has_other_cause(
     """
     # One or two views of planes that bend and were set up by hand show distortion as another target
     # (test_cli_stereo.py).
-    n_views = sum(problem.views.n_views for problem, _ in fits)
-    if named_lens and n_views < DETERMINE and richer_lens_is_better(found):
+    if sum(problem.views.n_views for problem, _ in fits) < DETERMINE and richer_lens_is_better(found):
         return True
     fits = views_for_target(fits)
     # An equation of the contest, which is on the given target, may count less on the found one.

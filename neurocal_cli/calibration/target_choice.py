@@ -74,7 +74,7 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     if found is None:
         return None
     doubtful = named and known is None and choice == "auto"
-    return None if doubtful and has_other_cause(fits, found, named) else found.target
+    return None if doubtful and has_other_cause(fits, found) else found.target
 
 
 def _common_survey(cameras: Sequence[Calibration]) -> Target | None:
@@ -228,8 +228,8 @@ def _searched(
     common = _found(solution, choice, None)
     found = common if choice == "flat" else _with_bends(solution, common)
     if found is not None and choice == "auto":
-        fit, named = (solution.problem, solution.adjusted), solution.has_named_lens
-        if contradicts_sigma(solution) or has_other_cause([fit], found, named, solution.repeated):
+        given = solution.problem, solution.adjusted
+        if contradicts_sigma(solution) or has_other_cause([given], found, solution.repeated):
             return kept, rejected
     # Bends that do not last when the camera is fitted to them were none.
     for start in dict.fromkeys((found, common)):

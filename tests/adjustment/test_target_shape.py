@@ -421,7 +421,7 @@ def test_some_of_many_views_tell_whether_a_model_is_too_simple(
     monkeypatch.setattr(find_module, "_DENSE", 60)
     found = find_target([fit])
     assert found is not None
-    assert has_other_cause([fit], found, True) == too_simple
+    assert has_other_cause([fit], found) == too_simple
 
 
 def test_a_given_camera_with_distortion_finds_the_target_as_well() -> None:

@@ -53,14 +53,14 @@ DECISIVE = 10.0  # difference of the criterion: odds of 150
 Starts = Callable[[Problem], Iterable[CameraState]]  # yields other starting states for a problem
 
 
-def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
+def with_more_starts(solution: Solution, more_starts: Starts | None) -> Solution:
     """The better of a solution and the results of other starts, if it may be a local minimum.
 
-    A solution without an estimated distortion is returned unchanged.
+    A solution without an estimated distortion, or without other starts, is returned unchanged.
     """
     problem = solution.problem
     # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.
-    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
+    if more_starts is None or not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
         return solution
     poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
     if not poor and solution.alike < _CORRELATED:
