@@ -25,7 +25,7 @@ from neurocal_cli.camera.distortion import MODELS, Distortion, Model
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_seed
-from neurocal_cli.network.options import Options, Progress, options_for
+from neurocal_cli.network.options import STARTS, Options, Progress, options_for
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, TargetChoice
 
@@ -65,7 +65,6 @@ TRAINERS = get_args(Trainer)
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = get_args(Outliers)
 
-_STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
 _NOT_FOUND = (
     "the target stays as given: either another shape does not predict the points of other views better, or "
@@ -92,7 +91,7 @@ def calibrate(
     start: Calibration | None = None,
     fix: Mapping[str, float] | None = None,
     square_pixels: bool = False,
-    starts: int = _STARTS,
+    starts: int = STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
     progress: Progress | None = None,
@@ -374,7 +373,7 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
     """
     given = camera_of(camera)
     problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)
-    solution = fit(problem, options_for("lm", _STARTS, seed))
+    solution = fit(problem, options_for("lm", seed=seed))
     found = calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
     return with_given_covariance(found, camera) if isinstance(camera, Calibration) else found
 

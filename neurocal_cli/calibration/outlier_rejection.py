@@ -35,7 +35,7 @@ from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, odd_view
 from neurocal_cli.calibration.point_errors import FLOOR, PointErrors, largest_expected, point_errors, rms
-from neurocal_cli.calibration.verdict.findings import MISFIT, TOLD, pixel_spread
+from neurocal_cli.calibration.verdict.findings import MISFIT, NO_WORSE, TOLD, pixel_spread
 from neurocal_cli.calibration.verdict.mistakes import error_of_view, located, why_odd
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
@@ -57,7 +57,6 @@ from neurocal_cli.observations.target import distinct_points
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
 _PASSES = 12
 _LITTLE = 0.05  # share of the points that can change without another minimum being the lowest
-NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _MAJORITY = 0.5  # share of the points that must be left
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
 _FEW = 30.0  # spare equations below which points are left out only if the evidence favours it

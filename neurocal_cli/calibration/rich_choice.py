@@ -19,11 +19,13 @@ from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.lens_choice.candidate_models import as_fisheye
+from neurocal_cli.calibration.lens_choice.given_model import WRONG_LENS
 from neurocal_cli.calibration.lens_choice.model_selection import predicts_decidedly_better
 from neurocal_cli.calibration.lens_choice.monotonic_fit import normal_part
 from neurocal_cli.calibration.lens_choice.rich_fit import promised, with_displacement
 from neurocal_cli.calibration.outlier_rejection import fit_robustly
 from neurocal_cli.calibration.verdict.contest import contest
+from neurocal_cli.calibration.verdict.findings import NO_WORSE
 from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
@@ -34,10 +36,9 @@ from neurocal_cli.network.options import Options
 # and of up to 1.19 for photographs of a board that is not flat (residual correlation 0.5).
 _FEWEST = 20  # fewest different poses
 _BETTER = 1.1  # least factor by which the rms error on held-out views must drop
-_PROMISED = 1.05  # the same for its prediction before the adjustment, which is right to a percent
-# Correlation of neighbouring residuals: from _ALIKE on the rich lens is tried, and up to _NOISE its own
-# residuals count as noise. Ordinary lenses leave 0.04 or less, a narrow bump 0.09.
-_ALIKE, _NOISE = 0.05, 0.15
+# Correlation of neighbouring residuals from which on the rich lens is tried. Ordinary lenses leave 0.04 or
+# less, a narrow bump 0.09.
+_ALIKE = 0.05
 _BETWEEN = ("two cameras", "a zoom that moves")  # that a rich lens must not leave
 
 
@@ -80,7 +81,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     start = replace(solution, problem=fisheye, adjusted=adjusted, target=None)
     try:
         others = _lost(solution, repeated)
-        if not promised(start, repeated).sum() * _PROMISED**2 < others.sum():
+        if not promised(start, repeated).sum() * NO_WORSE**2 < others.sum():
             return None
         rich = with_displacement(start)
     except (DegenerateGeometryError, np.linalg.LinAlgError):
@@ -88,7 +89,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     lost = _lost(rich, repeated)
     if not (np.isfinite(lost).all() and predicts_decidedly_better(lost, others, repeated, _BETTER)):
         return None
-    if rich.alike > _NOISE:
+    if rich.alike > WRONG_LENS:
         return None
     odd = contest(rich.minimum, size)
     if odd is not None and any(one.rival.cause in _BETWEEN for one in odd.causes):

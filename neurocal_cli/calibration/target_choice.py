@@ -40,10 +40,10 @@ from neurocal_cli.calibration.calibration import Calibration, Rejected, fixed_in
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.lens_choice.model_selection import find_lens_and_target
 from neurocal_cli.calibration.other_causes import contradicts_sigma, has_other_cause
-from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
+from neurocal_cli.calibration.outlier_rejection import fit_robustly
 from neurocal_cli.calibration.point_errors import MEDIAN, places_of_views, rms, squared_whitened
 from neurocal_cli.calibration.verdict.contest import contest
-from neurocal_cli.calibration.verdict.findings import DETERMINE
+from neurocal_cli.calibration.verdict.findings import DETERMINE, NO_WORSE
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.network.options import Options

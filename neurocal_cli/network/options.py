@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 # Most points of each view that train a network; more only take longer (test_convergence.py).
 MOST_POINTS = 1024
 
+STARTS = 20
+"""Most random starts for each network."""
+
 # Called with the name of a stage and the completed share of it.
 Progress = Callable[[str, float], None]
 
@@ -45,8 +48,8 @@ class Options:
 
 def options_for(
     trainer: str,
-    starts: int,
-    seed: int,
+    starts: int = STARTS,
+    seed: int = 0,
     *,
     distortion: str = "",
     preferred: str = "",

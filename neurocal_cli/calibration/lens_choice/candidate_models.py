@@ -20,6 +20,7 @@ from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import independent_residuals, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back, normal_part
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION, LEVEL
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import (
     POLYNOMIAL_MODELS,
@@ -42,15 +43,13 @@ _FISHEYES = ({"k2", "k3", "k4"}, {"k3", "k4"}, set[str]())
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 # Nested models, from simple to rich.
 _CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
-_SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
 _BEHIND = 1.5  # times the squared error of a richer model, from which on a model is fitted again
-# Chi-squared per coefficient that the rational model must promise; with less, it was never selected
-# (test_model_selection.py, slow: 100 scenes).
-_PROMISING = 4.0
 _ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
 _SPARE = 0.3  # fewest equations beyond the unknowns, per unknown of the camera and one pose
-_TOLD_APART = 4.0  # squared standard deviations per coefficient that differ significantly from 0
+# Squared standard deviations per coefficient that differ significantly from 0. If those of the rational model
+# promised less, it was never selected (test_model_selection.py, slow: 100 scenes).
+_TOLD_APART = 4.0
 # Chi-squared of p1 and p2 of a wide lens: photographs whose p1 is 2.5 std, counted by views, reach 35.
 _DECENTRED = 40.0
 _LARGEST_TERM = 3.0  # largest term of one coefficient at the farthest point; all terms together are about 1
@@ -193,7 +192,7 @@ class _Chain:
         if not np.isfinite(S).all():
             return False
         gain = float(g @ np.linalg.lstsq(S, g, rcond=_ROUNDING)[0])
-        return gain < _PROMISING * _NEW["rational"] * simpler.cost / rational.views.n_equations
+        return gain < _TOLD_APART * _NEW["rational"] * simpler.cost / rational.views.n_equations
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
         """Fit a model again from the next richer one if it is missing or far worse than that."""
@@ -229,7 +228,6 @@ class _Chain:
 
         It starts from the first state if that is one.
         """
-        from neurocal_cli.calibration.verdict.findings import LEVEL
         from neurocal_cli.calibration.verdict.rival import causes_among
         from neurocal_cli.calibration.verdict.rivals import RICHER_LENSES
 
@@ -323,7 +321,7 @@ def falls_short(fitted: Iterable[Candidate]) -> bool:
     from neurocal_cli.calibration.verdict.rivals import explained_by_shape
 
     best = min(fitted, key=lambda c: c.cost)
-    least = _SHORT**2 * float(least_of_free_networks(best.adjusted.normal).sum()) + 1e-20
+    least = CONTRADICTION.good**2 * float(least_of_free_networks(best.adjusted.normal).sum()) + 1e-20
     if best.cost <= least:
         return False
     return best.cost * (1.0 - explained_by_shape(best.problem.minimum(best.adjusted))) > least

@@ -40,7 +40,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 
 # Repeated by test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # had a larger correlation.
-_CORRELATED = 0.15  # correlation of neighbouring residuals
+WRONG_LENS = 0.15
+"""Correlation of neighbouring residuals from which on another minimum or lens may be the right one."""
 _FEW_VIEWS = 20  # most views with which other starts are tested, to limit the time
 LOWER = 0.999
 """Ratio of squared errors below which a minimum is lower."""
@@ -63,7 +64,7 @@ def with_more_starts(solution: Solution, more_starts: Starts | None) -> Solution
     if more_starts is None or not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
         return solution
     poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
-    if not poor and solution.alike < _CORRELATED:
+    if not poor and solution.alike < WRONG_LENS:
         return solution
     if not may_lead_lower(solution, LOWER, lambda few: [total_cost(_lowest(few, more_starts))]):
         return solution

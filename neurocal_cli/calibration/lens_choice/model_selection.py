@@ -40,6 +40,7 @@ from neurocal_cli.calibration.lens_choice.candidate_models import (
 )
 from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, LOWER, Starts, may_lead_lower
 from neurocal_cli.calibration.lens_choice.monotonic_fit import TIE
+from neurocal_cli.calibration.verdict.findings import LEVEL, NO_WORSE
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS
 from neurocal_cli.camera.geometry import Array
@@ -48,14 +49,11 @@ from neurocal_cli.observations.target import Target
 # Repeated by test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
 # 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
 # test_rendered_sets.py.
-# "Decidedly better" means by this number of standard errors over the five folds, and by this factor.
+# "Decidedly better" means by this number of standard errors over the five folds, and by a factor.
 _CERTAIN = 2.0
-_DECIDEDLY = 1.03
 _FAR_BETTER = 1.25  # factor by which a decentred wide lens must lower the rms error of ordinary ones
-_WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
-_RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
-_SIMPLER = -1.0  # and for a simpler one
+_SIMPLER = -1.0  # least gain in log evidence for a simpler model
 # Nested models: each has the coefficients of the previous one and more.
 _PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
 
@@ -181,7 +179,7 @@ def _best(
             candidate.coefficients > chosen.coefficients
             or candidate.criterion(n) < chosen.criterion(n) + DECISIVE
         )
-        and not predicts_decidedly_better(best.lost, candidate.lost, repeated, _DECIDEDLY)
+        and not predicts_decidedly_better(best.lost, candidate.lost, repeated, NO_WORSE)
     }
     return name, good
 
@@ -242,7 +240,7 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
     if not sound or not several:
         return sound or monotonic
     lowest = [min(c.held_out for c in some.values()) for some in (sound, monotonic)]
-    return sound if lowest[0] < _WORTH**2 * lowest[1] else monotonic
+    return sound if lowest[0] < NO_WORSE**2 * lowest[1] else monotonic
 
 
 def find_lens_and_target(
@@ -255,7 +253,7 @@ def find_lens_and_target(
     best = find_target(fits, flat, known, least_gain)
     if best is None:
         return None
-    for step, least in ((1, _RICHER), (-1, _SIMPLER)):
+    for step, least in ((1, LEVEL), (-1, _SIMPLER)):
         moved = False
         while (other := _with_other_lens(best, step, flat, best.evidence + least)) is not None:
             best, moved = other, True
@@ -280,7 +278,7 @@ def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found
 
 def richer_lens_is_better(found: Found) -> bool:
     """Whether one more distortion coefficient, with another target, explains the data decidedly better."""
-    return _with_other_lens(found, 1, found.target.flat, found.evidence + _RICHER) is not None
+    return _with_other_lens(found, 1, found.target.flat, found.evidence + LEVEL) is not None
 
 
 def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:

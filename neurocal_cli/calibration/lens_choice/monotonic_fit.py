@@ -25,6 +25,7 @@ from neurocal_cli.adjustment.adjust import Adjusted, Penalty
 from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.residual_correlation import independent_residuals
+from neurocal_cli.calibration.verdict.findings import TOLD
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, radial_part
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -53,7 +54,6 @@ _GUESS = 0.5  # slope with which a corner's radius is corrected
 ROUNDS = 12
 """Most penalties that are tried, one after another."""
 _STEPS, _MORE_STEPS = 60, 600
-_CHANCE = 10.8  # chi-squared of one condition, exceeded in one case of a thousand
 TIE = 0.009
 """Negligible relative increase of the rms error."""
 
@@ -145,7 +145,7 @@ def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted]
     cost = float(found.cost.sum())
     # The image circle of a wide lens may end within the image, and its corners show nothing.
     tie = 0.0 if found.state.distortion.wide else 2 * TIE
-    most = cost * (1 + max(tie, _CHANCE / independent_residuals(problem.views, found.state)))
+    most = cost * (1 + max(tie, TOLD**2 / independent_residuals(problem.views, found.state)))
     for least_slope in _LEAST:
         result = _with_slope(problem, found, most, least_slope)
         if result is not None:

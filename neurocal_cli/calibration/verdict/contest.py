@@ -18,6 +18,7 @@ from neurocal_cli.adjustment.residual_correlation import correlation, effective_
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.effects import another_lens, common, field, no_pupil
 from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
     DETERMINE,
     DISPLACED,
     ERROR,
@@ -280,7 +281,6 @@ def _steps(lin: Linearised, found: Estimate) -> Array:
 BIASED = Limit(2.0, 5.0)
 """Limits of a bias of the focal lengths and the centre, or of what is given or left out, over their std."""
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
-_LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
 
 
 def explains(contest: Contest, contradiction: float, error: float) -> bool:
@@ -292,7 +292,7 @@ def explains(contest: Contest, contradiction: float, error: float) -> bool:
     if error * left > ERROR.good < error:
         return False
     excess = 1.0 - contradiction**-2
-    return not (contradiction * left > _LEFT and contest.explained < EXPLAINED * excess)
+    return not (contradiction * left > CONTRADICTION.good and contest.explained < EXPLAINED * excess)
 
 
 def findings(contest: Contest, calibration: Calibration, given_told: bool) -> Iterator[Finding]:

@@ -39,6 +39,7 @@ from neurocal_cli.calibration.verdict.contest import Contest, contest, given_cam
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     LEVEL,
+    OUTLIERS,
     ROUNDED,
     SPARE,
     Finding,
@@ -54,7 +55,7 @@ from neurocal_cli.calibration.verdict.measures import (
 )
 from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.calibration.verdict.odd_points import OUTLIERS, with_rejected
+from neurocal_cli.calibration.verdict.odd_points import with_rejected
 from neurocal_cli.calibration.verdict.proportions import unlike_axes
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat

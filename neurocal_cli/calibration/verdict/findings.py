@@ -40,6 +40,10 @@ DETERMINE = 3
 """Views that determine a camera of their own, or tell bends of a target; more can contradict each other."""
 FEW_POINTS = 12
 """Fewest points that tell the size of their noise, to a fifth."""
+FEWEST = 6
+"""Fewest points that have something in common by a cause: so few do by chance once in 500,000 sets."""
+NO_WORSE = 1.05
+"""Factor by which one rms error of a camera is worse than another at least."""
 EXACT = 1e-4
 """Of the pixels' spread: an rms error this small is negligible."""
 ROUNDED = 1e-5
@@ -115,6 +119,8 @@ CONTRADICTION = Limit(1.6, 2.3)
 """Limits of an rms error over that of parts fitted by themselves: views, or the cameras of a rig."""
 ELSEWHERE = Limit(1.5, 4.0)
 """Limits of an error at other points over that at the own ones (test_given_points.py, cross-validation)."""
+OUTLIERS = Limit(0.02, 0.2)
+"""Limits of the share of outliers, of all points and of those of a view; clean views lose none."""
 CORRELATED = Limit(0.5, 0.85)
 """Limits of the correlation of neighbouring residuals, from which on they are no measurement noise."""
 

@@ -21,7 +21,9 @@ from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.point_errors import rms
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import (
+    FEWEST,
     LEVEL,
+    MISFIT,
     POOR,
     Mistake,
     Said,
@@ -40,14 +42,12 @@ from neurocal_cli.observations.points import Correspondences
 # Of one view. Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean
 # ones, none blamed).
 _HOLDS = 2.0  # times the rms error of the other views
-_STARTS = 20
 _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 # Of all views (test_mistakes.py).
-FEWEST_POINTS, ENOUGH_VIEWS = 6, 40
-"""Points of a view, and views, that tell a mistake in all of them."""
-_MAPPED = 0.03  # rms error of a homography over the spread of the pixels; lenses leave less
+ENOUGH_VIEWS = 40
+"""Views that tell a mistake in all of them."""
 _BETTER = 5.0  # times smaller than the error with the rows as given
 
 Mended = Callable[[Correspondences], Correspondences | None]
@@ -166,7 +166,7 @@ def mistake_in_all_views(points: Correspondences) -> tuple[str, str] | None:
     if len(axes) != 2:
         return None
     members = [points.view_index == view for view in range(points.n_views)]
-    members = [rows for rows in members if np.count_nonzero(rows) >= FEWEST_POINTS]
+    members = [rows for rows in members if np.count_nonzero(rows) >= FEWEST]
 
     def misfit(world: Array) -> float:
         """Median over the views of the rms error of a homography over the spread of the pixels."""
@@ -175,8 +175,8 @@ def mistake_in_all_views(points: Correspondences) -> tuple[str, str] | None:
 
     given = misfit(points.world) if members else 0.0
     for one in MISTAKES:
-        mended = one.mended(points) if given > _MAPPED * _BETTER else None
-        if mended is not None and misfit(mended.world) < min(_MAPPED, given / _BETTER):
+        mended = one.mended(points) if given > MISFIT * _BETTER else None
+        if mended is not None and misfit(mended.world) < min(MISFIT, given / _BETTER):
             return f"the {one.say(points)[0]}", one.advice
     return None
 
@@ -202,7 +202,7 @@ def why_odd(
     the `LEVEL` of all causes: seen from afar, a turned image or one of another size looks nearly like the
     same target in another pose, and a bend of the board takes in the rest.
     """
-    if not arrange(points).nearly_flat.all() or len(points) < FEWEST_POINTS:
+    if not arrange(points).nearly_flat.all() or len(points) < FEWEST:
         return otherwise
     limit, plain = _HOLDS * rmse_px, located(points, camera)
     mistakes = [
@@ -258,7 +258,7 @@ def located(points: Correspondences, camera: Camera) -> Solution | None:
 def solved(points: Correspondences, type: int, **given: Any) -> Solution | None:
     """The solution of `problem_for` points that may be wrong; None if there is none."""
     try:
-        return fit(problem_for(points, type, **given), options_for("lm", _STARTS, 0))
+        return fit(problem_for(points, type, **given), options_for("lm"))
     except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
         return None
 

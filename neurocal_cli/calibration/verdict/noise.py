@@ -21,9 +21,11 @@ from neurocal_cli.adjustment.residual_correlation import correlation, point_resi
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.verdict.findings import (
     CORRELATED,
+    ELSEWHERE,
     EXACT,
     EXPLAINED,
     FEW_POINTS,
+    FEWEST,
     Finding,
     name_some,
     pixel_spread,
@@ -33,11 +35,10 @@ from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
-# Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
+# Real sets (opencv_stereo, sony_chess, fisheye_stereo, Zhang's) stay below 1.3, and the rms of a view over
+# the lower quartile of all views below 3.
 _ONE_WAY = 2.5  # rms along u over that along v, or the reverse
-_VIEW = 4.0  # rms of a view over the lower quartile of all views
 _TAKEN_IN = 1e-2  # share of the error that is left
-_FEWEST = 6  # points with a sigma that is too small: so few reach the factor once in 500,000 sets
 # Between views or points whose sigma is too small and the others, and between the sigmas of such points.
 _FACTOR = 2.0
 _STATE = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
@@ -64,7 +65,7 @@ def noise_shape(points: Correspondences, residuals: Array, alike: float) -> Iter
     counts = np.bincount(index, minlength=n_views)
     rms = np.sqrt(np.bincount(index, (residuals**2).sum(axis=1), n_views) / counts)
     usual = float(np.interp(0.25 * (n_views - 1), np.arange(n_views), np.sort(rms)))
-    off = (rms > max(_VIEW * usual, least)) & (counts >= FEW_POINTS)
+    off = (rms > max(ELSEWHERE.poor * usual, least)) & (counts >= FEW_POINTS)
     if n_views > 2 and off.any():
         names = np.array(points.view_names)[off]
         yield (
@@ -128,7 +129,7 @@ def _too_small_at_some(points: Correspondences, covariance: Array, residuals: Ar
     n, counts = int(few.sum()), np.bincount(points.view_index)
     share = np.bincount(points.view_index, few) / counts
     of_views = ((share == 0) | (share == 1)).all()
-    if n < _FEWEST or of_views or common_share(covariance[~few], residuals[~few]) >= EXPLAINED:
+    if n < FEWEST or of_views or common_share(covariance[~few], residuals[~few]) >= EXPLAINED:
         return ""
     squared = (residuals**2).sum(axis=1)
 

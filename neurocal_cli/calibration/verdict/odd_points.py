@@ -14,16 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.findings import FEW_POINTS, TOLD, Finding, Limit, name_some
+from neurocal_cli.calibration.verdict.findings import (
+    EXPLAINED,
+    FEW_POINTS,
+    FEWEST,
+    OUTLIERS,
+    TOLD,
+    Finding,
+    name_some,
+)
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.points import Correspondences
 
-# Clipped: at least this number of points, and this share, have exactly the same outermost coordinate.
-_ALIKE = 6
-_ALIKE_SHARE = 0.01
 _BESIDE = 1.0  # px by which a detected point may lie outside the image
-_SOME = 0.01  # share of points outside the image up to which they count as single outliers
 _SAME = 1e-3  # px by which a copy of a view may differ
 _NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 _SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
@@ -40,10 +44,7 @@ _UNITS = {
     39.37: "metres and inches",
     3.281: "metres and feet",
 }
-OUTLIERS = Limit(0.02, 0.2)
-"""Limits of the share of outliers, of all points and of those of a view; clean views lose none."""
 _FEWEST_OUTLIERS = 4  # fewest outliers of a view, or views of a point
-_OF_A_POINT = 0.6  # share of its views in which a target point must be an outlier to be named
 _ON_A_POINT = 0.1  # of the distance of points: as far as two places may differ that are the same
 
 
@@ -92,14 +93,15 @@ def _step(pixels: Array) -> int:
 
 
 def _clipped(points: Correspondences) -> Iterator[Finding]:
+    fewest = max(FEWEST, OUTLIERS.good * len(points))
     for name, values in zip("uv", points.pixels.T, strict=True):
         for limit in (values.min(), values.max()):
             alike = values == limit
             count = int(alike.sum())
-            if count >= max(_ALIKE, _ALIKE_SHARE * len(values)):
+            if count >= fewest:
                 copied = np.column_stack([points.pixels, points.world])[alike]
                 count = len(distinct_rows(copied)[0])  # copies count once
-            if count >= max(_ALIKE, _ALIKE_SHARE * len(values)):
+            if count >= fewest:
                 yield (
                     1,
                     f"{count} points have the very same outermost {name} = {limit:.6g}: they are clipped",
@@ -123,7 +125,7 @@ def _outside(points: Correspondences) -> Iterator[Finding]:
     if count == 0 or points.undistorted:  # which spreads them beyond the image
         return
     text = f"{count} points lie outside the image" if count > 1 else "1 point lies outside the image"
-    if count <= _SOME * len(points):
+    if count <= OUTLIERS.good * len(points):
         yield 1, text, "correct or leave out these points"
     elif not _beyond(points.pixels, size[::-1]).any():
         yield (
@@ -340,7 +342,7 @@ def _of_targets(calibration: Calibration, lost: Correspondences, wrong_views: se
     place = place.reshape(-1)
     n_lost = np.bincount(place[: len(lost)], minlength=len(keys))
     n_seen = np.bincount(place, minlength=len(keys))
-    found = np.flatnonzero((n_seen >= _FEWEST_OUTLIERS) & (n_lost > _OF_A_POINT * n_seen)).tolist()
+    found = np.flatnonzero((n_seen >= _FEWEST_OUTLIERS) & (n_lost > EXPLAINED * n_seen)).tolist()
     of_point = [f"the point ({_numbers(key)})" for key in keys]
     if lost.point is not None and kept.point is not None:
         ids = np.concatenate([lost.point, kept.point])

@@ -19,9 +19,15 @@ import numpy as np
 
 from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.calibration.verdict.findings import CONTRADICTION, DETERMINE, EXPLAINED
+from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
+    DETERMINE,
+    EXPLAINED,
+    FEWEST,
+    STRETCHED_PRINT,
+)
 from neurocal_cli.calibration.verdict.linearised import Board
-from neurocal_cli.calibration.verdict.mistakes import ENOUGH_VIEWS, FEWEST_POINTS, solved
+from neurocal_cli.calibration.verdict.mistakes import ENOUGH_VIEWS, solved
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import causes_among
 from neurocal_cli.calibration.verdict.rivals import SHAPES
@@ -33,7 +39,6 @@ from neurocal_cli.observations.points import Correspondences
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
-_AWAY = 0.02  # least difference from 1; prints are less off, and boards of such small errors fit
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 _MEASURE = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
 
@@ -64,7 +69,7 @@ def proportions(points: Correspondences) -> Proportions | None:
         return None
     s *= _refined(found, axes)
     found = _fitted(points, axes[0], s)
-    if found is None or abs(np.log(s)) < _AWAY or not _is_noise(found):
+    if found is None or abs(np.log(s)) < STRETCHED_PRINT.poor or not _is_noise(found):
         return None
     # Boards that hardly differ in tilt may determine a camera only without skew.
     given = _fitted(points, axes[0], 1.0) or _fitted(points, axes[0], 1.0, skew=False)
@@ -98,7 +103,7 @@ def _axes(points: Correspondences) -> tuple[int, int] | None:
     order = np.argsort(extent)
     if not (extent[order[0]] <= _FLAT * extent[order[1]] and extent[order[1]] > 0):
         return None
-    if points.n_views <= DETERMINE or np.bincount(points.view_index).min() < FEWEST_POINTS:
+    if points.n_views <= DETERMINE or np.bincount(points.view_index).min() < FEWEST:
         return None
     first, second = sorted(order[1:].tolist())
     extents = np.array([np.ptp(world[:, [first, second]], axis=0) for world in worlds_by_view(points)])
