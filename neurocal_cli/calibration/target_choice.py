@@ -284,9 +284,9 @@ def _tell_independently(solution: Solution) -> bool:
     if not solution.repeated.worth < _WORTH:
         return True
     few = of_few_views(solution, solution.repeated.n_groups)
-    fits, named = [(few.problem, few.adjusted)], solution.has_named_lens
+    fits = [(few.problem, few.adjusted)]
     found = find_shape(fits, "auto", None, solution.model_errors is None)
-    return found is not None and not has_other_cause(fits, found, named)
+    return found is not None and not has_other_cause(fits, found)
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
