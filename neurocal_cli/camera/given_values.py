@@ -34,7 +34,10 @@ def real_rows(name: str, values: ArrayLike, columns: int, stacked: bool = False)
     array = real_array(name, values)
     if array.shape[-1:] != (columns,) or not (stacked or array.ndim == 2):
         shape = f"({'...' if stacked else 'N'}, {columns})"
-        raise InputError(f"{name} must have the shape {shape}, found {array.shape}")
+        flat = (
+            f"; numpy.reshape({name}, (-1, {columns})) makes them" if array.shape[-1:] == (columns,) else ""
+        )
+        raise InputError(f"{name} must have the shape {shape}, found {array.shape}{flat}")
     return array
 
 

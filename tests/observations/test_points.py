@@ -54,6 +54,7 @@ def test_lists_are_taken_and_arrays_are_copied_and_read_only() -> None:
     [
         ({"world": WORLD[:, :2]}, r"world must have the shape \(N, 3\), found \(6, 2\)"),
         ({"pixels": PIXELS.T}, r"pixels must have the shape \(N, 2\)"),
+        ({"pixels": PIXELS[:, None]}, r"found \(6, 1, 2\); numpy.reshape\(pixels, \(-1, 2\)\) makes them"),
         ({"world": WORLD[0]}, "shape"),
         ({"world": [["a", "b", "c"]]}, "array of real numbers"),
         ({"world": [[1, 2, 3], [4, 5]]}, "array of real numbers"),
