@@ -73,24 +73,26 @@ def frames(n_poses: int, n_frames: int, rng: np.random.Generator, own: float) ->
 
 
 def moving(
-    n: int, rng: np.random.Generator, lasting: float, curl: float = 0.0, noise: float = 0.12
+    n: int, rng: np.random.Generator, lasting: float, curl: float = 0.0, from_: Pose | None = None
 ) -> Correspondences:
-    """Frames of a board that moves smoothly; `lasting` is the correlation of errors from frame to frame."""
+    """Frames of a board that moves smoothly; `lasting` is the correlation of errors from frame to frame.
+
+    They are seen from another camera at `from_`, if it is given. Frames of generators with one seed show the
+    same motion, with other errors from another camera.
+    """
     phase, rate, share = (
-        rng.uniform(0, 2 * np.pi, (6, 3)),
-        rng.uniform(0.5, 2.0, (6, 3)),
-        rng.uniform(0.3, 1, (6, 3)),
+        rng.uniform(low, high, (6, 3)) for low, high in ((0, 2 * np.pi), (0.5, 2.0), (0.3, 1.0))
     )
     share /= share.sum(axis=1, keepdims=True)
     path = (share * np.sin(2 * np.pi * rate * np.arange(n)[:, None, None] / n + phase)).sum(axis=2)
     views = []
     for x, y, z, a, b, c in path:
         R = Pose.from_euler(0.8 * a, 0.8 * b, 0.6 * c, np.zeros(3)).R
-        views.append(
-            Pose(R, np.array([0.2 * x, 0.15 * y, 1.0]) * 420 * (1 + 0.3 * z) - R @ board().mean(axis=0))
-        )
+        t = np.array([0.15 * x, 0.1 * y, 1.0]) * 440 * (1 + 0.3 * z) - R @ board().mean(axis=0)
+        views.append(Pose(R, t) if from_ is None else Pose(from_.R @ R, from_.R @ t + from_.t))
+    rng = rng if from_ is None else rng.spawn(1)[0]
     exact = photographed(views, rng, 0.0, curl=curl)
-    error = noise * rng.normal(size=(n, COLS * ROWS, 2))
+    error = 0.12 * rng.normal(size=(n, COLS * ROWS, 2))
     for k in range(1, n):
         error[k] = lasting * error[k - 1] + np.sqrt(1 - lasting**2) * error[k]
     return replace(exact, pixels=exact.pixels + error.reshape(-1, 2))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,13 @@ from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
 from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SharedAndOwn, solve_scaled
 from neurocal_cli.adjustment.problem import normalised
+from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import (
     POSE_COLUMNS,
     free_columns,
     normal_blocks,
 )
+from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.evaluation import evaluate_camera
@@ -140,6 +143,17 @@ class RigFit:
         equations = sum(observed.views.n_equations for observed in self.problem.observations)
         unknowns = int(self.free.sum()) + 6 * len(self.problem.scale)
         return self.cost / max(equations - unknowns, 1)
+
+    @cached_property
+    def worth(self) -> float:
+        """Effective number of independent views over the number of views: fewer if they are alike."""
+        total = independent = 0.0
+        for side, observed in enumerate(self.problem.observations):
+            views, camera = observed.views, self.problem.camera(self.state, side)
+            alike = repeated_poses(views, camera, point_residuals(views, camera))
+            total += views.n_equations
+            independent += views.n_equations * alike.worth
+        return independent / total
 
 
 def scatter(fit: RigFit) -> tuple[float, int]:

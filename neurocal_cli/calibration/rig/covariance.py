@@ -4,6 +4,7 @@
   all points as independent. If the relative poses differ from frame to frame, only the frames are
   independent. The delete-one jackknife over them then gives the covariance, without a model of the
   differences (Efron and Stein 1981).
+* Views whose errors are alike, as those of frames of a video are (`adjustment.following_views`).
 * A target that was estimated with the cameras, and so is uncertain as well (`with_target_uncertainty`).
 * Unknowns that the common fit left out. They are open unknowns of the common bundle adjustment, as for a
   single camera (`adjustment.open_choices`): coefficients that the selected distortion models lack
@@ -78,7 +79,7 @@ def covariance_by_points(fit: RigFit) -> Covariance:
         whole, moved = contradicting_covariance(replace(fit, free=estimated)), fit.free[estimated]
         by_frames = whole[np.ix_(moved, moved)]
         least = by_frames if least is None else not_smaller(by_frames, least)
-    shared = found.shared if least is None else not_smaller(found.shared, least)
+    shared = (found.shared if least is None else not_smaller(found.shared, least)) / fit.worth
     of_all = covariance_by_given(fit)
     of_all[np.ix_(free, free)] += shared
     return replace(found, shared=of_all, follow=fit.normal.follow)
