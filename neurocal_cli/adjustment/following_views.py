@@ -26,7 +26,7 @@ from neurocal_cli.camera.geometry import Array, distinct_rows
 from neurocal_cli.camera.state import CameraState
 
 _FEWEST = 15  # views, and points of the target: fewer do not tell such a correlation from noise
-_POINTS = 50  # most points of the target that are used
+_VIEWS, _POINTS = 200, 50  # most views, and points of the target, that are used: they tell enough
 _CERTAIN = 5.0  # standard deviations of a correlation that is chance
 _LEAST = 0.3  # least correlation: photographs of paper boards, which bend, have up to 0.25
 _NO_MORE = 2.0  # the same standard deviations for the last one that counts
@@ -45,6 +45,9 @@ def following_views(
     `errors` (N, 2) are the normalised residuals in the order of the views' points, `state` is normalised, and
     `pose` (V,) is the number of each view's pose: views of one pose are no evidence.
     """
+    if views.n_views > _VIEWS:
+        views = views.subset(np.arange(_VIEWS))
+        errors = errors[: len(views.index)]
     V = views.n_views
     if V < _FEWEST or not np.isfinite(errors).all():
         return 1, 1.0
@@ -103,7 +106,7 @@ def _correlations(errors: Array, seen: Array, pose: NDArray[np.intp]) -> list[fl
     far = float((errors[:-half] * later[0]).sum()) / max(2 * float((seen[:-half] * later[1]).sum()), 1.0)
     found: list[float] = []
     for n in range(1, half):
-        other = (pose[n:] != pose[:-n])[:, None, None]
+        other = (pose[n : len(seen)] != pose[: len(seen) - n])[:, None, None]
         number = 2 * float((seen[:-n] * seen[n:] * other).sum())
         product = float((errors[:-n] * errors[n:] * other).sum())
         limit = max(_CERTAIN * np.sqrt(number), _LEAST * number) if n == 1 else _NO_MORE * np.sqrt(number)

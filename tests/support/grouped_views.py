@@ -88,7 +88,7 @@ def moving(
     views = []
     for x, y, z, a, b, c in path:
         R = Pose.from_euler(0.8 * a, 0.8 * b, 0.6 * c, np.zeros(3)).R
-        t = np.array([0.15 * x, 0.1 * y, 1.0]) * 440 * (1 + 0.3 * z) - R @ board().mean(axis=0)
+        t = np.array([0.19 * x, 0.14 * y, 1.0]) * 430 * (1 + 0.3 * z) - R @ board().mean(axis=0)
         views.append(Pose(R, t) if from_ is None else Pose(from_.R @ R, from_.R @ t + from_.t))
     rng = rng if from_ is None else rng.spawn(1)[0]
     exact = photographed(views, rng, 0.0, curl=curl)

@@ -21,6 +21,6 @@ def test_the_std_of_a_rig_from_videos_are_true(n: int) -> None:
         errors.append(
             [*of_cameras, *(rig.pose.t - true.t) / [rig.std[name] for name in ("t_x", "t_y", "t_z")]]
         )
-    # As independent frames they were 2.6 times their std, 6 at most.
-    assert np.sqrt(np.mean(np.square(errors))) < 1.4
+    # As independent frames they were 2.6 times their std, 6 at most. The five errors of a rig are alike.
+    assert np.sqrt(np.mean(np.square(errors))) < 1.15 + 1.0 / np.sqrt(n)
     assert np.abs(errors).max() < 4.0
