@@ -9,6 +9,7 @@ board whose first axis is multiplied by s fulfil
 which is linear in omega for a given s. A camera is fitted to the board with the s whose equations have the
 smallest residual, and the rival of a stretched target refines it. It is the cause if the camera then fits
 nearly as well as a separate camera for each view, and far better than with the coordinates as they are given.
+A camera that leaves a large error, as to pixels that are clipped, explains nothing.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     DETERMINE,
+    ERROR,
     EXPLAINED,
     FEWEST,
     STRETCHED_PRINT,
+    image_diagonal,
 )
 from neurocal_cli.calibration.verdict.linearised import Board
 from neurocal_cli.calibration.verdict.mistakes import ENOUGH_VIEWS, solved
@@ -74,7 +77,7 @@ def proportions(points: Correspondences) -> Proportions | None:
     # Boards that hardly differ in tilt may determine a camera only without skew.
     given = _fitted(points, axes[0], 1.0) or _fitted(points, axes[0], 1.0, skew=False)
     rms, given_px = (np.inf if one is None else _rms(one) for one in (found, given))
-    if not rms**2 < (1.0 - EXPLAINED) * given_px**2:
+    if not rms**2 < (1.0 - EXPLAINED) * given_px**2 or rms > ERROR.poor * image_diagonal(points):
         return None
     first, second = ("XYZ"[axis] for axis in axes)
     if s < 1:
