@@ -24,6 +24,7 @@ from neurocal_cli.adjustment.reprojection import POSE, camera_columns, derivativ
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.geometry import Array, distinct_rows
 from neurocal_cli.camera.state import CameraState
+from neurocal_cli.observations.measured_directions import measured_part
 
 _FEWEST = 15  # views, and points of the target: fewer do not tell such a correlation from noise
 _VIEWS, _POINTS = 200, 50  # most views, and points of the target, that are used: they tell enough
@@ -51,6 +52,7 @@ def following_views(
     V = views.n_views
     if V < _FEWEST or not np.isfinite(errors).all():
         return 1, 1.0
+    errors = measured_part(errors, views.across)
     label = distinct_rows(np.round(views.world / (1e-6 * views.scale[0])))[1]
     count = np.bincount(label)
     if np.count_nonzero(count > V // 2) < _FEWEST:
