@@ -189,7 +189,7 @@ class Minimum:
     normal: Array
     free: NDArray[np.bool_]  # (5 + K,) which of A's entries and the distortion coefficients are estimated
     free_poses: bool
-    repeated: RepeatedPoses | None = None  # views that repeat a pose; they stay in the same fold
+    repeated: RepeatedPoses | None = None  # views that share their errors; they stay in the same fold
 
     @property
     def columns(self) -> NDArray[np.intp]:

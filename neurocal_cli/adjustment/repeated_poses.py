@@ -83,7 +83,7 @@ class RepeatedPoses:
 
 
 def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedPoses:
-    """Find views that repeat a pose, given the normalised state of a fit.
+    """Find views that repeat a pose or share errors that last, given the normalised state of a fit.
 
     `errors` (N, 2) are its normalised residuals, in the order of the views' points.
     """

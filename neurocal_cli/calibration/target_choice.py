@@ -167,7 +167,7 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
 
 
 _ROUNDS = 3
-_WORTH = 0.8  # least effective share of the views, where some repeat a pose
+_WORTH = 0.8  # least effective share of the views that are asked together, where some share their errors
 _SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
 # Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
 # most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
