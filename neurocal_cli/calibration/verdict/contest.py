@@ -120,9 +120,9 @@ def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False
         if all(one.pattern == "all" for one in held.causes):
             return held
         lin = at_minimum(field, another_lens)
-        first = held.causes[0]
-        between = first.pattern != "all" and not first.rival.of_board
-        if between and estimates(lin, held.n, (ANOTHER_LENS,), first.evidence + LEVEL):
+        between = [one.pattern != "all" and not one.rival.of_board for one in held.causes]
+        told = [one.evidence for one in held.causes][: between.index(True) + 1] if any(between) else [np.inf]
+        if estimates(lin, held.n, (ANOTHER_LENS,), sum(told) + LEVEL):
             held = _held(lin, worth, (ANOTHER_LENS,))  # what it leaves of other causes would be guessed
         smooth, beside = estimates(lin, held.n, (NEIGHBOURS,)), lin
         for one in held.causes:
