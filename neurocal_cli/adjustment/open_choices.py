@@ -3,8 +3,8 @@
 A selected model may lack coefficients that the real lens has: p1 and p2, which no fisheye has, are correlated
 with the image centre, k3 with k1 and k2. Or it has them only because noise made them large. All these
 coefficients are called open here. Each group of them is either absent or has a Gaussian prior, whose width is
-three times or a third of the typical size in real lenses, the same factor for all groups (spike and slab,
-George and McCulloch 1993).
+three times or a third of the typical size in real lenses (spike and slab, George and McCulloch 1993). Each
+group has a width of its own: small k2 and k3 do not tell that p1 and p2 are small.
 To second order around the minimum, all these models follow from one normal matrix. Let w_m be the posterior
 probability of model m, P_m and o_m its posterior covariance and mean of the open coefficients o, o_r their
 reported values (0 if they were left out), and T = dc/do the response of the camera parameters c. Then
@@ -61,12 +61,13 @@ _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",)
 _DECENTRED = (*_FISHEYE, (("p1", "p2"), 1, 0.0015))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
-_ODDS = {1.0: 3.0}  # prior odds that a group of the typical size is present
+# Prior odds that a group is present, by the factor of its typical size: half a decade above and below. k3 is
+# small in most lenses.
+_ODDS, _ODDS_OF_K3 = {3.0: 1.5, 0.3: 1.5}, {3.0: 0.75, 0.3: 2.25}
 # A fisheye that stands for an ordinary lens, whose polynomials fold in the corners: such lenses have p1 and
 # p2, and those of most are small.
-_ODDS_ORDINARY = {1.0: 100.0, 0.1: 100.0}
+_ODDS_ORDINARY = {3.0: 50.0, 0.3: 100.0, 0.03: 50.0}
 WIDE_REACH = 0.7  # least radius of the points of a wide lens: 35 degrees from the axis
-_SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above and below
 
 
 @frozen_dataclass(eq=False)
@@ -80,7 +81,6 @@ class OpenPrior:
     groups: tuple[NDArray[np.intp], ...]  # indices of open unknowns that are present or absent together
     # For each group, the factors of its size that it may have, and the prior odds of each over its absence.
     odds: tuple[Mapping[float, float], ...]
-    scales: tuple[float, ...] = _SCALES  # common factors of all sizes, equally probable
 
 
 @frozen_dataclass(eq=False)
@@ -161,6 +161,7 @@ def open_at_points(
         if places:
             groups.append(np.array(places))
     everything = np.append(free[:5], np.ones(len(names), dtype=bool))
+    odds = {"k3": _ODDS_OF_K3, "p1": _ODDS_ORDINARY if ordinary else _ODDS}
     is_open, left_out = (
         np.array([False] * 5 + [name in some for name in names])[everything]
         for some in (open_names, set(names) - estimated)
@@ -172,7 +173,7 @@ def open_at_points(
         np.where(left_out, 0.0, np.append(np.zeros(int(free[:5].sum())), reported))[is_open],
         size,
         tuple(groups),
-        tuple(_ODDS_ORDINARY if ordinary and open_names[k[0]] == "p1" else _ODDS for k in groups),
+        tuple(odds.get(open_names[group[0]], _ODDS) for group in groups),
     )
     return OpenCoefficients(richer, reported, everything, prior)
 
@@ -242,12 +243,10 @@ def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Prior std (m, o) of the open unknowns in each model, 0 if absent; log prior; whether all are absent."""
     states = [({0.0: 1.0} | dict(own)).items() for own in prior.odds]
     factors, odds = np.moveaxis(np.array(list(product(*states))), 2, 0)  # (m, number of groups)
-    size = np.zeros((len(prior.scales), len(factors), len(prior.size)))
+    size = np.zeros((len(factors), len(prior.size)))
     for group, own in zip(prior.groups, factors.T, strict=True):
-        size[..., group] = np.multiply.outer(prior.scales, np.outer(own, prior.size[group]))
-    n = len(prior.scales)
-    logarithm, is_none = np.log(odds).sum(axis=1), ~factors.any(axis=1)
-    return size.reshape(n * len(factors), -1), np.tile(logarithm, n), np.tile(is_none, n)
+        size[:, group] = np.outer(own, prior.size[group])
+    return size, np.log(odds).sum(axis=1), ~factors.any(axis=1)
 
 
 def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:
@@ -341,7 +340,7 @@ def spread_of_stretch(arrow: Arrowhead, variance: float, m: int = 2) -> SpreadOf
     is_open = np.arange(len(g)) >= len(g) - m
     groups = (np.array([0]), np.array([1])) if m == 2 else (np.arange(m),)
     odds = _ODDS_OF_PRINTS[: len(groups)]
-    prior = OpenPrior(is_open, is_open, np.zeros(m), np.full(m, STRETCH), groups, odds, (1.0,))
+    prior = OpenPrior(is_open, is_open, np.zeros(m), np.full(m, STRETCH), groups, odds)
     found = spread_of_open(arrow, variance, prior)
     if found is None:
         return None

@@ -32,18 +32,16 @@ def test_what_was_left_out_makes_the_camera_less_certain_than_its_model_by_name(
 
 def test_the_spread_is_the_mean_square_around_what_is_reported() -> None:
     """One coefficient, absent or of either size: by numerical integration over its density."""
-    precision, size, odds, one = 40.0, 0.2, 3.0, np.array([True])
+    precision, size, odds, one = 40.0, 0.2, {3.0: 1.5, 0.3: 1.5}, np.array([True])
     for value, gradient in ((0.0, 5.0), (0.3, 0.0)):  # left out, and estimated
         left_out = one & (value == 0.0)
-        prior = OpenPrior(
-            one, left_out, np.array([value]), np.array([size]), (np.array([0]),), ({1.0: odds},)
-        )
+        prior = OpenPrior(one, left_out, np.array([value]), np.array([size]), (np.array([0]),), (odds,))
         x = np.linspace(-6.0, 6.0, 240_001)
         likelihood = np.exp(gradient * (x - value) - 0.5 * precision * (x - value) ** 2)
         absent = np.interp(0.0, x, likelihood)
-        second, total = 2 * absent * value**2, 2 * absent
-        for scale in (3.0, 0.3):
-            density = odds * likelihood * gaussian(x, scale * size)
+        second, total = absent * value**2, absent
+        for factor, its in odds.items():
+            density = its * likelihood * gaussian(x, factor * size)
             second += trapezoid(density * (x - value) ** 2, x)
             total += trapezoid(density, x)
         arrow = Arrowhead.alone(np.array([[precision]]), np.array([gradient]), 0.0)
@@ -51,7 +49,7 @@ def test_the_spread_is_the_mean_square_around_what_is_reported() -> None:
         assert spread is not None
         already = 0.0 if value == 0.0 else 1.0 / precision
         assert spread.E[0, 0] == pytest.approx(second / total - already, rel=1e-6)
-        assert spread.probability == pytest.approx(1.0 - 2 * absent / total, rel=1e-6)
+        assert spread.probability == pytest.approx(1.0 - absent / total, rel=1e-6)
 
 
 @pytest.mark.slow
