@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from neurocal_cli.errors import NeurocalError as NeurocalError
     from neurocal_cli.files.board_yaml import read_board as read_board
     from neurocal_cli.files.calibration_yaml import read_calibration as read_calibration
+    from neurocal_cli.files.exchange.reading import read_camera as read_camera
     from neurocal_cli.files.images import read_image as read_image
     from neurocal_cli.files.lens_files import read_lens as read_lens
     from neurocal_cli.files.lens_files import read_lens_data as read_lens_data
@@ -117,6 +118,7 @@ _HOMES = {
     "plot": "commands.show.results",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_yaml",
+    "read_camera": "files.exchange.reading",
     "read_rig": "files.rig_yaml",
     "read_image": "files.images",
     "read_lens": "files.lens_files",
@@ -151,6 +153,10 @@ def __getattr__(name: str) -> Any:
         if public not in globals() and hasattr(module, public):
             globals()[public] = checked(getattr(module, public), _Names())
     return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
 
 
 class _Names(dict[str, Any]):

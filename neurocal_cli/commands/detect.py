@@ -19,7 +19,7 @@ from neurocal_cli.commands.boards import (
     described_board,
     with_other_kind,
 )
-from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
+from neurocal_cli.commands.frames import STORED, detections, of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
     debugging,
@@ -299,8 +299,7 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
         counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())
         warn(
             f"the images have different EXIF orientations ({counts}), so their image centres differ although "
-            "they may be of one camera; remove the orientation from all files, for example with `exiftool "
-            "-Orientation= FILE`, and detect again"
+            f"they may be of one camera; {STORED}, and detect again"
         )
     check_size(outcomes.values(), board)
     if not found and len(outcomes) == 1:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from neurocal_cli.detection.detect import Detection
 
 _TRIMMED = 4  # px; a larger difference is no accident
+STORED = "remove the orientation from all files, for example with `exiftool -Orientation= FILE`"
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
 
 
@@ -83,15 +84,21 @@ def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
             both = "{} x {} px and {} have {} x {}".format(
                 *detection.image_size, "as many" if tied else "most", *most
             )
-            problem = f"{name}: the image has {both}{_why_another_size(detection.image_size, most)}"
+            by_exif = any(outcome.turned for outcome in outcomes.values())
+            problem = f"{name}: the image has {both}{_why_another_size(detection.image_size, most, by_exif)}"
             if tied:
                 raise InputError(problem)
             kept[name] = replace(outcomes[name], detection=None, overlay=None, problem=problem)
     return kept
 
 
-def _why_another_size(size: tuple[int, int], most: tuple[int, int]) -> str:
-    """What probably happened to an image of another size than most, and what to do."""
+def _why_another_size(size: tuple[int, int], most: tuple[int, int], by_exif: bool) -> str:
+    """What probably happened to an image of another size than most, and what to do.
+
+    `by_exif` tells whether images were turned as their EXIF orientations say.
+    """
+    if size == most[::-1] and by_exif:
+        return f", because their EXIF orientations differ; {STORED}, and detect again"
     if size == most[::-1]:
         turned = "upright" if size[1] > size[0] else "on its side"
         return f": it was held or turned {turned}; turn it back, as each way has its own image centre"

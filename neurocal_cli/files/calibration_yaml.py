@@ -289,7 +289,7 @@ _OTHERS = {
     "lens": ("is a zoom lens", "give its camera at one setting, from neurocal lens camera"),
     "camera_info": (
         "has no neurocal block, so the poses and points are missing",
-        "it can serve as --intrinsics, here give a file that calibrate wrote",
+        "it can serve as --intrinsics, in Python by read_camera; here give a file that calibrate wrote",
     ),
     "": ("has no neurocal block", "give a file that calibrate wrote"),
 }

@@ -286,7 +286,7 @@ def read_camera_info(root: Field) -> tuple[str, tuple[int, int] | None, Array | 
 
 
 def format_camera_info(camera: Camera, rectified: tuple[Array, Array] | None = None) -> str:
-    """Text of a camera_info file, which `read_intrinsics` reads; see `camera_info_lines`."""
+    """Text of a camera_info file, which `read_camera` reads; see `camera_info_lines`."""
     return "\n".join([*camera_info_lines(camera, rectified), ""])
 
 

@@ -30,7 +30,7 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
 from neurocal_cli.files.camera_tree import read_tree
-from neurocal_cli.files.exchange.reading import read_intrinsics
+from neurocal_cli.files.exchange.reading import read_camera
 from neurocal_cli.files.key_tables import Columns, Keys, Kind, check_format, inline, record
 from neurocal_cli.files.points_csv import POINTS, correspondences
 from neurocal_cli.files.reading import read_bytes
@@ -347,7 +347,7 @@ def _cameras(tables: list[Table], notes: list[str]) -> LensCameras:
 def _in_rows(table: Table) -> list[Camera]:
     """The cameras of a table: of the files that it names, relative to its folder, or of their parameters."""
     if _FILES in table.labels:
-        return [read_intrinsics(Path(table.source).parent / name) for name in table.labels[_FILES].tolist()]
+        return [read_camera(Path(table.source).parent / name) for name in table.labels[_FILES].tolist()]
     values = table.stack(_CAMERA)
     positive = (values[:, :2] > 0).all(axis=1)
     if not positive.all():

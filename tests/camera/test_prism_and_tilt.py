@@ -16,7 +16,7 @@ from support.slow_cases import slow_but
 from neurocal_cli import Calibration, Camera, Intrinsics, calibrate
 from neurocal_cli.camera.distortion import WITH_PRISM, Distortion, coefficient_names
 from neurocal_cli.camera.polynomial import tilted, untilted
-from neurocal_cli.files.exchange.reading import read_intrinsics
+from neurocal_cli.files.exchange.reading import read_camera
 
 SIZE = (1200, 900)
 PLAIN = [-0.15, 0.04, 8e-4, -5e-4, -0.004, 0.0, 0.0, 0.0]
@@ -42,11 +42,11 @@ def opencv_file(model: str, place: Path) -> tuple[Path, Camera]:
 @either_model
 def test_opencvs_files_are_read_and_written(model: str, tmp_path: Path) -> None:
     path, camera = opencv_file(model, tmp_path)
-    assert read_intrinsics(path).distortion.model == model
+    assert read_camera(path).distortion.model == model
     for ending in ("yml", "xml", "json"):
         again = tmp_path / f"again.{ending}"
         assert run("convert", path, "--to", "opencv", "-o", again).exit_code == 0
-        found = read_intrinsics(again)
+        found = read_camera(again)
         assert (found.distortion.coefficients == camera.distortion.coefficients).all()
         assert (camera.A == found.A).all()
 
@@ -57,7 +57,7 @@ def test_a_plain_lens_with_zeros_for_prism_and_tilt_is_a_plain_one(tmp_path: Pat
     path.write_text(
         json.dumps({"camera_matrix": [[800, 0, 600], [0, 800, 440], [0, 0, 1]], "distortion_coefficients": k})
     )
-    assert read_intrinsics(path).distortion.model == "plumb_bob"
+    assert read_camera(path).distortion.model == "plumb_bob"
 
 
 def test_another_program_gets_the_nearest_lens_and_its_error(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_another_program_gets_the_nearest_lens_and_its_error(tmp_path: Path) -> 
     assert "has no distortion model tilted; the nearest of its models" in refused.stderr
     assert run("convert", path, "--to", "mrcal", "--model", "thin_prism", "-o", out).exit_code == 0
     assert "LENSMODEL_OPENCV12" in out.read_text()
-    assert read_intrinsics(out).distortion.model == "thin_prism"
+    assert read_camera(out).distortion.model == "thin_prism"
 
 
 def test_the_tilt_has_an_inverse() -> None:
@@ -123,7 +123,7 @@ def test_the_command_calibrates_a_tilted_camera(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.exit_code == 0, done.stderr
     assert "tauX" in done.stdout + done.stderr
-    camera = read_intrinsics(tmp_path / "camera.yaml")
+    camera = read_camera(tmp_path / "camera.yaml")
     assert camera.distortion.model == "tilted"
     np.testing.assert_allclose(camera.distortion.coefficients, found.distortion, rtol=1e-3, atol=1e-6)
     rays = camera.unproject(points.pixels)

@@ -289,9 +289,9 @@ def test_an_image_comes_from_stdin(folder: Path) -> None:
     assert "\nstdin,h:0:0," in result.stdout
 
 
-def turn_by_exif(path: Path) -> None:
-    """Add the EXIF orientation of an image upside down."""
-    exif = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 274, 3, 1, 3, 0, 0)
+def turn_by_exif(path: Path, orientation: int = 3) -> None:
+    """Add an EXIF orientation, by default that of an image upside down."""
+    exif = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
     body = struct.pack(">I", len(exif)) + b"eXIf" + exif + struct.pack(">I", zlib.crc32(b"eXIf" + exif))
     data = path.read_bytes()
     path.write_bytes(data[:33] + body + data[33:])
@@ -313,6 +313,19 @@ def test_images_of_different_orientations_are_warned_of(folder: Path) -> None:
     (warning,) = [line for line in result.stderr.splitlines() if line.startswith("warning:")]
     assert "different EXIF orientations (2 as stored, 1 turned by 180 degrees)" in warning
     assert "remove the orientation" in warning
+
+
+@pytest.mark.parametrize("upright", [["board02"], ["board01", "board02"]])
+def test_images_turned_upright_are_told_to_be_so_by_their_orientation(
+    folder: Path, upright: list[str]
+) -> None:
+    """Nobody held the camera another way; a program that ignores the orientation has images of one size."""
+    for name in upright:
+        turn_by_exif(folder / f"{name}.png", 6)
+    result = detect(folder, *BOARD)
+    assert result.exit_code == 0
+    (line,) = [line for line in result.stderr.splitlines() if "because their EXIF" in line]
+    assert "remove the orientation from all files" in line
 
 
 @pytest.mark.parametrize("words", [["detect", "--help"], ["calibrate", str(SAMPLES / "flat.csv")]])

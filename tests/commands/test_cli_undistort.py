@@ -16,7 +16,7 @@ from support.command_line import run
 from support.places import SAMPLES
 
 from neurocal_cli import Correspondences, read_calibration, read_points, undistort_image, undistort_points
-from neurocal_cli.files.exchange.reading import read_intrinsics
+from neurocal_cli.files.exchange.reading import read_camera
 from neurocal_cli.files.points_csv import write_points
 
 SIZE = (400, 300)
@@ -92,7 +92,7 @@ def test_images_go_to_a_folder(camera: Path, images: Path, tmp_path: Path) -> No
     names = sorted(path.name for path in (tmp_path / "straight").iterdir())
     assert names == ["board01.png", "board02.png", "board03.png"]
     seen = picture(images / "board01.png")
-    expected = undistort_image(seen, read_intrinsics(camera))
+    expected = undistort_image(seen, read_camera(camera))
     assert np.array_equal(picture(tmp_path / "straight" / "board01.png"), expected)
     assert not np.array_equal(expected, seen)
 
@@ -125,7 +125,7 @@ def test_depth_and_colours_stay(camera: Path, tmp_path: Path, dtype: type, shape
     assert undistort(camera, tmp_path / "in.png", "-o", tmp_path / "out.png").exit_code == 0
     done = picture(tmp_path / "out.png")
     assert (done.shape, done.dtype) == (image.shape, image.dtype)
-    assert np.array_equal(done, undistort_image(image, read_intrinsics(camera)))
+    assert np.array_equal(done, undistort_image(image, read_camera(camera)))
 
 
 def test_sixteen_bits_do_not_become_eight(camera: Path, tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_camera_without_a_size_takes_that_of_the_first_image(images: Path, tmp
     result = undistort(path, images, "--alpha", 0, "--camera", tmp_path / "n.yaml", "-o", tmp_path / "out")
     assert result.exit_code == 0
     assert "undistorted 3 of 4" in result.stderr
-    assert read_intrinsics(tmp_path / "n.yaml").image_size == SIZE
+    assert read_camera(tmp_path / "n.yaml").image_size == SIZE
 
 
 def test_an_image_that_was_turned_says_so(camera: Path, tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_the_new_camera_is_that_of_the_corrected_images(camera: Path, images: Pa
         tmp_path / "a.png",
     )
     assert result.exit_code == 0
-    new = read_intrinsics(tmp_path / "n.yaml")
+    new = read_camera(tmp_path / "n.yaml")
     assert (new.distortion.model, new.image_size, new.name) == ("none", SIZE, "left")
     assert new.intrinsics.alpha_u < 480
     again = undistort(tmp_path / "n.yaml", tmp_path / "a.png", "-o", tmp_path / "b.png")
@@ -219,9 +219,7 @@ def test_the_new_camera_is_that_of_the_corrected_images(camera: Path, images: Pa
 
 def test_by_default_the_camera_matrix_stays(camera: Path, points: Path, tmp_path: Path) -> None:
     undistort(camera, points, "-o", tmp_path / "out.csv", "--camera", tmp_path / "n.yaml")
-    assert np.array_equal(
-        read_intrinsics(tmp_path / "n.yaml").intrinsics.A, read_intrinsics(camera).intrinsics.A
-    )
+    assert np.array_equal(read_camera(tmp_path / "n.yaml").intrinsics.A, read_camera(camera).intrinsics.A)
 
 
 # Points
@@ -232,7 +230,7 @@ def test_points_go_to_standard_output(camera: Path, points: Path, tmp_path: Path
     assert (result.exit_code, result.stderr) == (0, "")
     (tmp_path / "done.csv").write_text(result.stdout)
     done, seen = read_points(tmp_path / "done.csv"), read_points(points)
-    expected = undistort_points(seen, read_intrinsics(camera))
+    expected = undistort_points(seen, read_camera(camera))
     assert np.array_equal(done.pixels, expected.pixels)
     assert np.array_equal(done.covariance, expected.covariance)  # type: ignore[arg-type]
     assert np.array_equal(done.world, seen.world)

@@ -14,7 +14,7 @@ from support.real_data import RealFiles
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import read_extrinsics
-from neurocal_cli.files.exchange.reading import read_intrinsics
+from neurocal_cli.files.exchange.reading import read_camera
 from neurocal_cli.files.result_files import write_calibration
 
 K = [[600.0, 0.5, 320.0], [0.0, 610.0, 240.0], [0.0, 0.0, 1.0]]
@@ -75,7 +75,7 @@ distortion_coefficients:
 
 @pytest.fixture
 def read(tmp_path):
-    def read_text(text, read=read_intrinsics):
+    def read_text(text, read=read_camera):
         path = tmp_path / "camera.yaml"
         path.write_text(text, encoding="utf-8")
         return read(path)
@@ -130,7 +130,7 @@ def test_files_written_by_opencv_are_read(tmp_path):
         storage.write("camera_matrix", np.array(K))
         storage.write("distortion_coefficients", np.array([[-0.1, 0.02, 1e-5, 0.0, 1 / 3]]))
         storage.release()
-        camera = read_intrinsics(path)
+        camera = read_camera(path)
         assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
         assert camera.distortion.coefficients.tolist() == [-0.1, 0.02, 1e-5, 0.0, 1 / 3]
         assert camera.image_size == (640, 480)
@@ -166,7 +166,7 @@ def test_the_distortion_models_of_ros_get_our_names(read, model, data, ours):
 def test_a_neurocal_file_gives_its_camera_and_its_poses(tmp_path):
     cal = made_calibration(3)
     write_calibration(cal, tmp_path / "cal.yaml")
-    camera = read_intrinsics(tmp_path / "cal.yaml")
+    camera = read_camera(tmp_path / "cal.yaml")
     assert camera.intrinsics == cal.intrinsics
     with pytest.raises(FormatError, match="its poses are in mm, but the points in cm; give both in one unit"):
         read_extrinsics(tmp_path / "cal.yaml", "cm")
@@ -238,7 +238,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory, text, s
     path.write_text(text[:start] + junk + text[start + length :], encoding="utf-8")
     message = ""
     try:
-        read_intrinsics(path)
+        read_camera(path)
     except FormatError as error:
         message = str(error)
     assert message.isprintable()
@@ -246,12 +246,12 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory, text, s
 
 def test_real_camera_files_are_read(real_files: RealFiles) -> None:
     (path,) = real_files("opencv_stereo/left_intrinsics.yml")
-    opencv = read_intrinsics(path)
+    opencv = read_camera(path)
     assert opencv.intrinsics.alpha_u == 535.91573396163199
     assert opencv.distortion.coefficients[4] == 0.23839153080878486
     assert opencv.image_size == (640, 480)
     (path,) = real_files("sony_chess/intrinsic.yaml")
-    boofcv = read_intrinsics(path)
+    boofcv = read_camera(path)
     assert (boofcv.intrinsics.alpha_v, boofcv.intrinsics.u0) == (698.6537946928421, 308.4551818095542)
     assert boofcv.distortion.coefficients.tolist() == [
         -0.25559248570886445,

@@ -31,7 +31,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
 from neurocal_cli.files.exchange.format_table import CameraSet
-from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
+from neurocal_cli.files.exchange.reading import FORMATS, read_camera, read_cameras
 
 SIZE = (640, 480)
 READ = {name: target for name, target in FORMATS.items() if name not in ("dlt", "lensfun")}  # written only
@@ -92,7 +92,7 @@ def test_a_camera_comes_back_from_each_format_as_it_was(target: str, model: str,
     for ending in (".yaml", ".xml", ".json") if target == "opencv" else (".file",):
         found = read_back(written(given, target, tmp_path, ending))
         same(found.cameras[0], given.cameras[0])
-        same(read_intrinsics(written(given, target, tmp_path, ending)[0]), given.cameras[0])
+        same(read_camera(written(given, target, tmp_path, ending)[0]), given.cameras[0])
 
 
 @pytest.mark.parametrize("target", RIGS)
@@ -225,7 +225,7 @@ def test_a_dictionary_of_mtx_and_dist_is_a_camera(key: str, tmp_path: Path) -> N
     (tmp_path / "a.json").write_text(json.dumps(tree))
     np.savez(tmp_path / "a.npz", **{name: np.array(value) for name, value in tree.items()})
     for name in ("a.json", "a.npz"):
-        assert read_intrinsics(tmp_path / name).distortion.coefficients.tolist() == [-0.1, 0.02, 0, 0, 0.003]
+        assert read_camera(tmp_path / name).distortion.coefficients.tolist() == [-0.1, 0.02, 0, 0, 0.003]
 
 
 REFUSED = {

@@ -24,7 +24,7 @@ from neurocal_cli.commands.convert import convert
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
 from neurocal_cli.files.exchange.format_table import CameraSet
-from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
+from neurocal_cli.files.exchange.reading import FORMATS, read_camera, read_cameras
 
 KEPT = [(name, model) for name, target in FORMATS.items() for model in WIDE if model in target.models]
 
@@ -43,7 +43,7 @@ def test_a_wide_camera_comes_back_from_each_format_as_it_was(target: str, model:
     camera = wide_camera(model)
     for ending in (".yaml", ".xml", ".json") if target == "opencv" else (".file",):
         path = written(CameraSet((camera,)), target, tmp_path, ending)
-        for found in (read_cameras([path]).cameras[0], read_intrinsics(path)):
+        for found in (read_cameras([path]).cameras[0], read_camera(path)):
             assert found.distortion.model == model
             assert found.image_size == SIZE
             points = wide_points()
@@ -119,7 +119,7 @@ def test_omnidirectional_cameras_of_opencv_are_read(
     xi, *k = camera.distortion.coefficients.tolist()
     tree = {keys[0]: camera.A.tolist(), keys[1]: [k], "xi": [[xi]] if as_matrix else xi}
     (tmp_path / "omni.json").write_text(json.dumps(tree))
-    found = read_intrinsics(tmp_path / "omni.json")
+    found = read_camera(tmp_path / "omni.json")
     expected = plainly_projected("omnidir", [xi, *k], camera.A, wide_points())
     assert np.abs(found.project(wide_points())[0] - expected).max() < 1e-6
 
@@ -188,7 +188,7 @@ def test_an_omnidirectional_camera_of_boofcv_is_read(tmp_path: Path) -> None:
     (tmp_path / "cam.yaml").write_text(BOOFCV.format(*k, f=f, g=1.01 * f))
     A = np.array([[f, 0.5, 503.2], [0, 1.01 * f, 396.7], [0, 0, 1]])
     expected = plainly_projected("omnidir", k, A, wide_points())
-    found = read_intrinsics(tmp_path / "cam.yaml").project(wide_points())[0]
+    found = read_camera(tmp_path / "cam.yaml").project(wide_points())[0]
     assert np.abs(found - expected).max() < 1e-6
     (tmp_path / "cam.yaml").write_text(BOOFCV.format(*k, f=f, g=f).replace("]", ", 0.1]"))
     with pytest.raises(FormatError, match=r"radial_tangential/radial\[2\] is not known"):

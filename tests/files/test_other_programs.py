@@ -16,7 +16,7 @@ from support.real_data import FOLDER, RealFiles
 from neurocal_cli import Camera, read_points
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.exchange.reading import read_cameras, read_intrinsics
+from neurocal_cli.files.exchange.reading import read_camera, read_cameras
 
 # Of each file with one camera: fx, skew, fy, u0, v0 (pixels from 0), coefficients in OpenCV's order, and the
 # image size. A fisheye has "fisheye" before its coefficients.
@@ -234,7 +234,7 @@ def test_the_camera_of_a_file_projects_as_its_numbers_say(name: str, real_files:
     told = "fisheye" if name in TOLD else None
     for camera in (
         read_cameras([path], warnings=warnings, distortion=told).cameras[0],
-        read_intrinsics(path, distortion=told),
+        read_camera(path, distortion=told),
     ):
         check(camera, entries, lens)
         assert camera.image_size == size
@@ -462,7 +462,7 @@ DIALECTS: dict[str, tuple[list[float], list[Any]]] = {
 def test_a_dialect_is_read(text: str, tmp_path: Path) -> None:
     (tmp_path / "camera").write_text(("calib_time: now\n" if text[:2] == "S_" else "") + text)
     entries, lens = DIALECTS[text]
-    check(read_intrinsics(tmp_path / "camera"), entries, lens)
+    check(read_camera(tmp_path / "camera"), entries, lens)
 
 
 FAULTS = {
@@ -586,7 +586,7 @@ def test_toml_is_read_also_without_python_s_reader(
 def test_arrays_without_names_are_told_by_their_shape(tmp_path: Path) -> None:
     views = np.zeros((7, 3, 1))
     np.savez(tmp_path / "a.npz", np.array(json.loads(K)), np.array([FIVE]), views, views)
-    check(read_intrinsics(tmp_path / "a.npz"), CAMERA, FIVE)
+    check(read_camera(tmp_path / "a.npz"), CAMERA, FIVE)
 
 
 def test_a_stated_model_is_not_overruled(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ def test_both_packages_have_the_same_names() -> None:
     for name in neurocal.__all__:
         assert getattr(neurocal, name) is getattr(neurocal_cli, name)
         assert name in dir(neurocal)
+    assert dir(neurocal_cli) == sorted(neurocal_cli.__all__)  # what a notebook completes
     with pytest.raises(AttributeError, match="module 'neurocal' has no attribute 'nothing'"):
         neurocal.nothing  # noqa: B018 - reading it is the test
 

@@ -44,6 +44,7 @@ from neurocal_cli.calibration.verdict.findings import (
     SPARE,
     Finding,
     log_odds,
+    or_else,
     pixel_spread,
 )
 from neurocal_cli.calibration.verdict.measures import (
@@ -330,14 +331,16 @@ class Evidence:
         if held is None or not any(one.rival.of_given for one in held.causes):
             return []
         left = (1.0 - held.explained) * held.lin.cost
-        if hides.any() and log_odds(self.cost, left, held.n) < -LEVEL:
+        odds = log_odds(self.cost, left, held.n) if hides.any() else np.inf
+        if odds < -LEVEL:
             return []
         if shaped:
             off = self._centre_with_shape(points, views, state) / held.lin.state.entries[0, 0]
             given = [one for one in held.causes if one.rival.of_given]
             moved = tuple(replace(one, amounts=np.append(one.amounts[:-2], off)) for one in given)
             held = replace(held, causes=moved)
-        return given_camera(held, c)
+        instead = or_else(["tangential distortion of the lens"]) if odds < LEVEL else ""
+        return [(grade, reason + instead, advice) for grade, reason, advice in given_camera(held, c)]
 
     def _centre_with_shape(self, points: Correspondences, views: Views, state: CameraState) -> Array:
         """(2,) how far the given centre is off if the shape of the target is estimated, too; normalised."""

@@ -279,13 +279,30 @@ def read_cameras(
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
 
 
-def read_intrinsics(
+def read_camera(
     path: str | Path,
     notes: list[str] | None = None,
     warnings: list[str] | None = None,
     distortion: str | None = None,
 ) -> Camera:
-    """Read a single camera without its poses, from any file of `read_cameras`."""
+    """Read one camera without its poses, from a file of any program that ``neurocal convert`` reads.
+
+    It serves as `intrinsics` of `calibrate`, and to project and undistort points.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``-`` is standard input.
+    notes, warnings : list of str, optional
+        Remarks about what was read, and doubts about it, are appended.
+    distortion : str, optional
+        The distortion model, where a file has coefficients and does not say of which model.
+
+    Raises
+    ------
+    FormatError
+        No known format, a rig, or a file that contradicts itself; the message says what to do.
+    """
     return camera_of(read_given_camera(path, notes, warnings, distortion))
 
 

@@ -116,6 +116,22 @@ def test_neither_tangential_distortion_nor_a_bent_target_hides_a_wrong_centre(tr
         assert not any("is given, but" in reason for reason in right.reasons)
 
 
+@pytest.mark.parametrize("trial", [5, 11])
+def test_what_tangential_distortion_explains_as_well_is_not_put_to_the_centre_alone(trial: int) -> None:
+    """The centre is right, and the lens has p1; a wrong centre without p1 is hardly more probable."""
+    rng = np.random.default_rng([trial, 31])
+    scene = random_flat_set(rng, 8, False, cols=9, rows=6, f=1000.0, width=1280)
+    scene = through(scene, "k1k2p1p2", [-0.1, 0.05, -7e-4, 0.0])
+    points, given = scene.points(0.2, rng), scene.given(2)["image_center"]
+    told = [
+        one
+        for one in calibrate(points, type=2, image_center=given).verdict.reasons
+        if " is given, but" in one
+    ]
+    assert all(one.endswith("(or, hardly less probable: tangential distortion of the lens)") for one in told)
+    assert told
+
+
 @pytest.mark.parametrize("seeds", slow_but([1], [1, 12]))
 def test_a_bent_board_does_not_make_a_true_centre_wrong(seeds: int) -> None:
     for seed in range(seeds):
