@@ -253,15 +253,14 @@ def _left_out(rig: Rig) -> Iterator[Finding]:
             EACH_PART,
         )
     odd = {name: why for name, why in faults.items() if not why.startswith(TAKEN)}
-    if odd:
-        shifted = any(why in SHIFTED.values() or why.startswith(NEIGHBOUR) for why in odd.values())
-        yield (
-            _LEFT_OUT.grade(len(odd) / n),
-            f"{described(odd, n, kind)} and were left out",
-            PAIR_ANEW if shifted
-            else SAME_MOMENT if set(odd.values()) == {UNSYNCHRONISED}
-            else "look at these views, and take them again",
-        )  # fmt: skip
+    shifted = any(why in SHIFTED.values() or why.startswith(NEIGHBOUR) for why in odd.values())
+    yield (
+        _LEFT_OUT.grade(len(odd) / n),
+        f"{described(odd, n, kind)} and were left out",
+        PAIR_ANEW if shifted
+        else SAME_MOMENT if set(odd.values()) == {UNSYNCHRONISED}
+        else "look at these views, and take them again",
+    )  # fmt: skip
 
 
 def _frames(rig: Rig, e: _Evidence) -> Iterator[Finding]:
@@ -325,10 +324,9 @@ def _precision(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if len(seen) > 2:
         what = f"the distance of {second} from {first}, its nearest neighbour,"
     yield SHARE.grade(share), f"the std of {what} is {percent(share)} of its length", more
-    if np.isfinite(e.held_out):
-        yield (
-            ELSEWHERE.grade(e.held_out),
-            f"the cross-validation error is {e.held_out * rig.rmse_px:.3g} px, but the error on all data "
-            f"{rig.rmse_px:.3g} px",
-            "add frames",
-        )
+    yield (
+        ELSEWHERE.grade(e.held_out),
+        f"the cross-validation error is {e.held_out * rig.rmse_px:.3g} px, but the error on all data "
+        f"{rig.rmse_px:.3g} px",
+        "add frames",
+    )

@@ -270,13 +270,12 @@ def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if calibration.type == 3:
         return
     cover = e.coverage
-    if np.isfinite(cover.image):
-        where = f", above all {cover.empty}" if cover.empty else ""
-        yield (
-            _UNCOVERED.grade(1 - cover.image),
-            f"the points cover {100 * cover.image:.0f} % of the image",
-            f"add views with the target elsewhere in the image{where}",
-        )
+    where = f", above all {cover.empty}" if cover.empty else ""
+    yield (
+        _UNCOVERED.grade(1 - cover.image),
+        f"the points cover {100 * cover.image:.0f} % of the image",
+        f"add views with the target elsewhere in the image{where}",
+    )
     if calibration.type in (1, 2) and len(calibration.views) > 1:
         yield (
             _FLAT.grade(-cover.tilt),
