@@ -290,8 +290,7 @@ class Evidence:
         held = self._contest_at(replace(m, views=views, state=state))
         if held is None or not held.of_all_views:
             return kept
-        remains = kept is not None and any(one.rival is held.causes[0].rival for one in kept.causes)
-        return replace(held, of_outliers=True, remains=remains)
+        return replace(held, of_outliers=True)
 
     def _contest_at(self, m: Minimum, free: NDArray[np.bool_] | None = None) -> Contest | None:
         """The contest at a minimum with these parameters free, by default those of the calibration."""
