@@ -37,7 +37,6 @@ _LEVEL_FROM = 5  # the ring of 0.3; smaller ones have few pixels, so that their 
 _INSIDE, _AROUND = 7, 1.5  # the ring of 0.4, within all marks, and the radius up to which a mark ends
 _NEXT = 0.54  # of the distance to the next mark, of the last ring
 _BLUR = 2.2  # standard deviations of the blur from the edge to where the paper is blank
-_SHARP = 0.15  # of the radius: of an edge less blurred, a small displacement is a large change of light
 _BLURS = 0.7, 0.85, 1.0, 1.2  # of that by the steepest place, which samples on rings do not meet
 _NEAR = 4.0  # standard deviations of the blur, within which a sharpened edge overshoots
 _HOLE = 0.5  # least step of the light at the edge of a hole, over that at the other edge
@@ -46,25 +45,22 @@ _STAGGERED = 1.2  # distance of the next marks in steps; 1.4 where each second r
 
 _LABELLED = 1 / 8  # of the marks, beside which there may be ink, or which are partly hidden
 
-# What grids of circles hardly depart by, lights in contrasts, and how far departures add up as squares, where
-# circles are looked for and where they are described, which may be blurred by a hand as far as they are
-# wide. Of 1225 views of 336 rendered grids, four are beyond the first; of 354 that are described, all but one
-# have 17 at most, and of 90 other lattices, one has 35 and the others 60 and more (test_circles.py).
-_OFF = 0.005  # of the distance to the next mark: from where those around a mark predict it
+# What grids of circles hardly depart by, in px of their outlines and in contrasts of the light.
+_OFF = 0.1  # px, from where those around a mark predict it
+_SIZES = 0.05  # px rms, of the radius from a smooth change
+_LONG = 0.06  # px, of two periods of most outlines by the angle, beyond noise
+_CORNERED = 0.012  # px, of three and more periods of the mean outline, beyond what the marks differ by
 _INKS = 0.013  # rms, of the share of the paper's light from a smooth change
-_SIZES = 0.01  # rms, of the log of the radius from a smooth change
 _MIXED = 0.007  # rms, of the light by the distance from that of a disc or a ring
-_LONG = 0.02  # amplitude of two periods of the light by the angle, where it is half-way
-_CORNERED = 0.005  # of three and more periods
 _SIGNED = 0.06  # spread of the light within most marks beyond that around them
 _RULED = 0.015  # change of the light in the paper between the marks
-_DEPARTURES = 8.0, 45.0
 
 
-def are_circles(light: Image, places: Array, centre: Array, area: Array, described: bool) -> bool:
-    """Whether marks (N,) of an area [px^2] at places (N, 2) of a board are circles on blank paper.
+def departure_from_circles(light: Image, places: Array, centre: Array, area: Array, described: bool) -> float:
+    """How far marks (N,) of an area [px^2] at places (N, 2) of a board are from circles on blank paper.
 
-    They may depart more from these if a board of circles is `described`.
+    What they depart by is added up in squares, over what grids of circles hardly depart by. Some marks of a
+    `described` board may be hidden.
     """
     flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
     start, steps = predicted(places, places, centre, flattening, itself=False)
@@ -72,7 +68,8 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     away = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
     apart = float(away[away > 0].min())
     radius = min(float(np.median(np.sqrt(area / np.pi) / side)), 0.5 * apart)
-    off = float(np.median(np.hypot(*(centre - start).T) / side)) / apart
+    off = float(np.median(np.hypot(*(centre - start).T)))
+    scale = radius * float(np.median(side))  # px
     # The first angle of each quarter is farthest from the next marks.
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS + (0.25 * np.pi if apart < _STAGGERED else 0.0)
     shares = np.arange(_FIRST, _NEXT * apart / radius, _STEP)
@@ -106,31 +103,38 @@ def are_circles(light: Image, places: Array, centre: Array, area: Array, describ
     mean = levels.mean(axis=0)
     darker = np.flatnonzero(mean[: outer + 1].mean(axis=1) < 0.5)
     if not len(darker):
-        return False
+        return np.inf
     half = int(darker[-1])
-    long, *corners = (np.abs(np.fft.rfft(mean[half])) / _RAYS)[2 : _RAYS // 2].tolist()
     across = levels[:, inner : outer + 1].mean(axis=2)
     beyond = np.maximum((across > 0.5).argmax(axis=1), 1)
     before, after = (across[np.arange(len(across)), k] for k in (beyond - 1, beyond))
     back = np.clip((after - 0.5) / np.maximum(after - before, 0.1), 0, 1)
-    sizes = odd(np.log(shares[inner + beyond] - _STEP * back))
+    sizes = scale * odd(np.log(shares[inner + beyond] - _STEP * back))
     within, around = (float(np.median(levels[:, k].std(axis=1))) for k in (_INSIDE, edge))
     signed = np.sqrt(max(within**2 - around**2, 0.0))
     step = abs(profile[outer] - profile[inner])
     blur = _STEP * radius * step / max(np.sqrt(2 * np.pi) * np.abs(np.diff(profile)).max(), 1e-9)
     # The light is half-way between this ring and the next one.
-    level, next_level = mean[[half, min(half + 1, len(mean) - 1)]].mean(axis=1)
+    further = min(half + 1, len(mean) - 1)
+    level, next_level = mean[[half, further]].mean(axis=1)
     between = (0.5 - level) / max(next_level - level, 0.5 - level, 1e-9)
+    outline = levels[:, half] + between * (levels[:, further] - levels[:, half])
+    periods = np.fft.rfft(outline, axis=1)[:, 2 : _RAYS // 2] / _RAYS
+    periods *= np.sqrt(2 * np.pi) * blur * scale / radius
+    power = np.median(np.abs(periods) ** 2, axis=0)
+    long = np.sqrt(max(power[0] - power[1:].mean(), 0.0))  # noise is alike in all
+    corners = periods[:, 1:].mean(axis=0)
+    noise = np.sqrt((np.abs(periods[:, 1:] - corners) ** 2).mean(axis=0) / len(periods))
+    cornered = float((np.abs(corners) / np.hypot(noise, _CORNERED)).max())
     blank = rings[half] + between * _STEP * radius + _BLUR * blur
     clear = (rings > blank) & (rings < apart - blank)
     at = places[:, None, None] + shift[clear]
     inside = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
-    cornered = max(corners) * min(1.0, blur / (_SHARP * radius))
     near = rings < 0.5 * apart
     mixed = _misfit(mean[near].mean(axis=1), shares[near])
-    found = np.array([off, inks, sizes, mixed, long, cornered, signed, _ruled(levels[:, clear], inside)])
-    usual = [_OFF, _INKS, _SIZES, _MIXED, _LONG, _CORNERED, _SIGNED, _RULED]
-    return bool(((found / usual) ** 2).sum() <= _DEPARTURES[described])
+    found = np.array([off, inks, sizes, mixed, long, signed, _ruled(levels[:, clear], inside)])
+    usual = [_OFF, _INKS, _SIZES, _MIXED, _LONG, _SIGNED, _RULED]
+    return float(((found / usual) ** 2).sum()) + cornered**2
 
 
 def _misfit(light: Array, at: Array) -> float:

@@ -304,6 +304,35 @@ def test_circles_may_be_labelled_and_sharpened() -> None:
     assert seen_circles(sharpened) is not None
 
 
+@pytest.mark.parametrize("corners", [0, 6])
+def test_blurred_nuts_are_no_circles(corners: int) -> None:
+    image = np.full((960, 1280), 60, np.uint8)
+    angle = 2 * np.pi * np.arange(corners or 360) / (corners or 360)
+    shape = np.stack([290 + 40 * np.cos(angle), 270 + 40 * np.sin(angle)], axis=-1)
+    for row in range(4):
+        for column in range(6):
+            places = np.rint(8 * (shape + 140 * np.array([column, row]))).astype(np.int32)
+            cv2.fillPoly(image, [places], (170,), cv2.LINE_AA, 3)
+    seen = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    assert (seen_circles(cv2.GaussianBlur(seen, (0, 0), 1.7)) is None) == bool(corners)
+
+
+def test_circles_that_are_not_clear_need_a_second_image() -> None:
+    large = np.full((1280, 1680), 200, np.uint8)
+    for row in range(6):
+        for column in range(7):
+            # The distances along both axes differ by a twentieth, so these are no circles on a board.
+            cv2.circle(large, (180 + 208 * column, 150 + 198 * row), 56, (50,), -1, cv2.LINE_AA)
+    image = cv2.GaussianBlur(cv2.resize(large, (420, 320), interpolation=cv2.INTER_AREA), (0, 0), 1.2)
+    seen = seen_circles(image)
+    assert seen is not None
+    assert (seen.full, seen.whole) == (True, False)
+    with pytest.raises(NoBoardError, match="unclear circles, such as 7 x 6 circles"):
+        found_board([image])
+    plane = found_board([image, image[::-1]]).plane
+    assert (plane.cols, plane.rows) == (7, 6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", no_boards.KINDS)
 def test_no_board_is_found_where_there_is_none(kind: str) -> None:

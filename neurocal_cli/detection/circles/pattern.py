@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
-from neurocal_cli.detection.appearance import are_circles
+from neurocal_cli.detection.appearance import departure_from_circles
 from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, lattices
 from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.placement import NoBoardError
@@ -28,9 +28,12 @@ _LEAST_SHARE = 0.7  # of a pattern
 _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
 _LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses no rows of smaller ones
-# Images that show the same full pattern without what is around it, and their least share.
+# Images that show the same full pattern, but not clearly or not what is around it, and their least share.
 _AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
+# Greatest departure from circles: in any image, and in one that needs no second one that agrees, as other
+# things in rows seldom do.
+_DEPARTURE, _CLEARLY = 11.0, 5.0
 _MOST_OF_SIDE = 0.6  # of the places beside a pattern; a row there is full, or the pattern is not
 
 
@@ -41,7 +44,7 @@ class SeenCircles:
     cols: int
     rows: int
     asymmetric: bool
-    whole: bool  # whether it fills the pattern, and the image shows that it ends at all sides
+    whole: bool  # whether it clearly fills the pattern, and the image shows that it ends at all sides
     full: bool = False  # whether it fills the pattern
     beside: tuple[SeenCircles, ...] = ()  # other whole ones in the image
 
@@ -81,10 +84,12 @@ def _seen_in(
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    if not are_circles(grey.astype(np.float32), places, centre, area, described=False):
+    departure = departure_from_circles(grey.astype(np.float32), places, centre, area, described=False)
+    if departure > _DEPARTURE:
         return None
     full = share == 1
-    return replace(seen, whole=full and _ends_seen(places, centre, area, grey.shape), full=full)
+    whole = full and departure < _CLEARLY and _ends_seen(places, centre, area, grey.shape)
+    return replace(seen, whole=whole, full=full)
 
 
 def _likelihood(one: tuple[float, SeenCircles, Array]) -> tuple[float, bool, int]:
@@ -146,8 +151,9 @@ def agreed_circles(seen: Sequence[SeenCircles]) -> tuple[CirclePlane, bool]:
     if not enough:
         one, _ = Counter(seen).most_common(1)[0]
         raise NoBoardError(
-            f"only parts of a grid of circles are seen, such as {one}; show the whole board and what is "
-            "around it, or describe it by --board, for example circles:7x6:20"
+            f"only parts of a grid of circles are seen, or unclear circles, such as {one}; show the whole "
+            "board and what is around it, sharp and in more images, or describe it by --board, for example "
+            "circles:7x6:20"
         )
     (one,) = enough
     return CirclePlane("", one.cols, one.rows, 1.0, asymmetric=one.asymmetric), sure
