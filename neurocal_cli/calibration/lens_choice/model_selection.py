@@ -28,7 +28,7 @@ from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
 from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.adjustment.residual_correlation import point_residuals
+from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.candidate_models import (
@@ -38,7 +38,13 @@ from neurocal_cli.calibration.lens_choice.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, LOWER, Starts, may_lead_lower
+from neurocal_cli.calibration.lens_choice.given_model import (
+    DECISIVE,
+    LOWER,
+    WRONG_LENS,
+    Starts,
+    may_lead_lower,
+)
 from neurocal_cli.calibration.lens_choice.monotonic_fit import TIE
 from neurocal_cli.calibration.verdict.findings import LEVEL, NO_WORSE
 from neurocal_cli.camera.directions import WIDE
@@ -139,12 +145,18 @@ def _may_lead_lower(
 def _limit(fitted: dict[str, Candidate]) -> float:
     """Squared error below which the result of another start is accepted; 0: no other start is needed.
 
-    It is infinite if free networks fit far better or no model is sound. If a focal length is poorly
-    determined, another start must be better.
+    It is infinite if free networks fit far better, no model is sound, or only wide lenses are found and leave
+    more than noise. If a focal length is poorly determined, another start must be better.
     """
+    closest = min(fitted.values(), key=lambda c: c.cost)
+    if closest.problem.distortion.wide and not any(
+        fitted[m].sound for m in POLYNOMIAL_MODELS[1:] if m in fitted
+    ):
+        views = closest.problem.views
+        if correlation(views, point_residuals(views, closest.adjusted.state)) > WRONG_LENS:
+            return np.inf
     if not any(c.sound for c in fitted.values()) or falls_short(fitted.values()):
         return np.inf
-    closest = min(fitted.values(), key=lambda c: c.cost)
     return LOWER * closest.cost if closest.weak else 0.0
 
 
