@@ -222,9 +222,13 @@ def _best(
     others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
     for one in [one for one in (*best, *others) if one.weights.size][: _MOST + 1]:
         both = including(at, one)
-        second = estimates(both, both.spare * share, _others([one], rivals), highest - one.evidence)
-        # One of them is common to all views: changes of groups and of single views look like each other.
-        second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
+        single = one.pattern == "one"
+        apart = _others([one, ranking[0]] if single else [one], rivals)
+        second = estimates(both, both.spare * share, apart, highest - one.evidence)
+        # One of them is common to all views, as changes of groups look like each other; or it is in one view
+        # alone, and what each view has in its own way is no longer the same as without it.
+        beside = ("all", "") if single else ("all",)
+        second = [x for x in second if not x.rival.unknown and (one.pattern == "all" or x.pattern in beside)]
         if second and one.evidence + second[0].evidence > highest:
             best, highest = (one, second[0]), one.evidence + second[0].evidence
     return best[:1] if best[0] is ranking[0] else best
