@@ -319,6 +319,8 @@ def _check_names(names: list[str], schema: Schema) -> None:
         hint += schema.instead
     if missing == ["X", "Y", "Z"] and ({"row", "col"} <= set(names) or "point" in names):
         hint += ", or give --board chessboard:COLSxROWS:SQUARE"
+    elif missing == ["X", "Y", "Z"]:
+        hint += "; points of unknown place, such as markers of a wand, do not calibrate a camera"
     raise InputError(
         f"column{'s' * (len(missing) > 1)} {', '.join(missing)} missing from the header "
         f"{','.join(names)[:60]!r}; {hint}"

@@ -115,6 +115,15 @@ def test_points_that_take_in_all_of_the_error_are_told(real_files: RealFiles) ->
     assert "with the points as stated it is 4.17 px rms" in found.verdict.reasons[0]
 
 
+@pytest.mark.parametrize("seed", [20, 27])
+def test_what_the_lens_leaves_open_counts_where_the_points_take_in_all_of_the_error(seed: int) -> None:
+    points = surveyed(seed, n=44, n_views=1, std=4.0, spread=0.0)[0]
+    chosen, named = calibrate(points), calibrate(points, distortion="none")
+    assert chosen.distortion_model == "none"
+    assert chosen.rmse_px < 0.01
+    assert chosen.std["u0"] > 1.5 * named.std["u0"]
+
+
 def test_a_poor_point_is_no_outlier_and_a_wrong_one_is() -> None:
     points, _, _ = surveyed(4, std=0.05, spread=0.0)
     world, std = np.array(points.world), np.array(points.world_std)

@@ -224,6 +224,8 @@ FAULTS = {
     "": "a.csv: is empty",
     "\n\n# unit: mm\n": "a.csv: is empty",
     "X,Y,Z,u,v\n": "a.csv:1: there are no points below the header",
+    "frame,camera,u,v\n1,2,3,4\n": "a.csv:1: columns X, Y, Z missing from the header 'view,camera,u,v'; "
+    "name the columns X,Y,Z,u,v; points of unknown place, such as markers of a wand, do",
     "x,y,Z,u,v\n1,2,3,4,5\n": "a.csv:1: columns X, Y missing from the header 'x,y,Z,u,v'; write x as X",
     "view,X,Y,u,v\na,1,2,3,4\n": "a.csv:1: column Z missing",
     "left,h:0:0,12.5,0,0,301,118\n": "a.csv:1: there is no header, but 'left,h:0:0,12.5,0,0,",

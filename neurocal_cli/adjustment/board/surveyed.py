@@ -33,7 +33,10 @@ _SETTLED = 0.02  # of the standard deviations of cameras and points
 _MOST_DENSE = 3000  # most unknowns
 _GRID = 13
 _NEAR = 1e-3  # accuracy of a logarithm
-_LEAST_NOISE, _LARGEST_NOISE = 1e-3, 2.0  # range of the noise over the residuals' level with the given points
+# Range of the noise over the residuals' level with the given points. A smaller one is as likely where the
+# points take in all of the error; the residuals would then pass for exact, and what the choice of the lens
+# leaves open would not count.
+_LEAST_NOISE, _LARGEST_NOISE = 0.03, 2.0
 _LEAST_RATIO = 1e-3  # least ratio of survey error to pixel noise, and the reverse
 _CONTRADICTED = 5.0  # gain in log likelihood that contradicts the survey: one correct survey of 600
 _OFF = 1.4  # least factor that matters
