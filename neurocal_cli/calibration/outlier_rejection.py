@@ -58,7 +58,7 @@ _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any ou
 _PASSES = 12
 _LITTLE = 0.05  # share of the points that can change without another minimum being the lowest
 _MAJORITY = 0.5  # share of the points that must be left
-_LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
+_LOOKS = 2  # consensus passes through the lens: outliers may still bias the first
 _FEW = 30.0  # spare equations below which points are left out only if the evidence favours it
 _FEW_EACH = 3.0  # the same for each unknown, as in views of four to twelve points (test_few_views.py)
 _FALLS = 0.5  # factor on the rms error without outliers that noise hid; without half of the noise it is 0.55
@@ -179,8 +179,8 @@ def _agreeing(
 
     `first` is the fit of all points, or `failure` the reason why there is none.
 
-    A wide lens displaces points by more than outliers do. So once the lens is known, the consensus is
-    repeated on rays.
+    A lens may displace points by more than outliers do. So once it is known, the consensus is repeated on
+    rays.
     """
     points = problem.points
     views = arrange(_by_plane(points))
@@ -203,8 +203,6 @@ def _agreeing(
             raise failure from None
         raise
     for _ in range(_LOOKS):
-        if not solution.state.distortion.wide:
-            break
         rays = solution.camera.unproject(points.pixels)
         rays = np.where(np.isfinite(rays), rays, _BACKWARDS)
         again = find_consensus(replace(views, rays=rays if views.order is None else rays[views.order]), rng)

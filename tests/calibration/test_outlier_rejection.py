@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.campaign import scene as campaign_scene
+from support.distorted import through
 from support.outliers import MISMATCHES, farthest, good, mismatched, with_outliers
 from support.scenes import pinhole, random_flat_set, table_1
 from support.simulated_targets import draw
@@ -164,3 +165,16 @@ def test_points_of_little_noise_do_not_make_others_wrong() -> None:
     sigma = np.where(points.view_index == 3, 0.6, 0.2)[:, None]
     points = replace(points, pixels=points.pixels + sigma * rng.normal(size=points.pixels.shape))
     assert reject(points).n_rejected == 0
+
+
+@pytest.mark.parametrize("seed", slow_but([2], [1, 2, 3, 11, 13]))
+def test_no_view_is_left_out_for_a_few_outliers_that_its_distortion_hides(seed: int) -> None:
+    """Outliers of 20 px beside a distortion as large: each view's network keeps some."""
+    rng = np.random.default_rng([seed, 41])
+    scene = random_flat_set(rng, 8, False, cols=9, rows=6, f=2000.0, width=2000)
+    points = through(scene, "k1k2", [-0.2, 0.06]).points(0.05, rng)
+    wrong = rng.random(len(points)) < 0.04
+    pixels = points.pixels + wrong[:, None] * rng.normal(0, 20, (len(points), 2))
+    rejected = calibrate(replace(points, pixels=pixels), distortion="k1k2").rejected
+    assert not rejected.views
+    assert rejected.rows.tolist() == np.flatnonzero(wrong).tolist()
