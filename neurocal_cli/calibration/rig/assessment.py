@@ -187,11 +187,8 @@ def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     yield from _frames(rig, e)
     yield from _precision(rig, e)
     for name, verdict in e.cameras.items():
-        # Reasons and advice come the worst first.
-        for k, reason in enumerate(verdict.reasons):
-            yield (1 if k else WORDS.index(verdict.word)), told[name, reason], ""
-        for k, advice in enumerate(verdict.advice):
-            yield (1 if k else WORDS.index(verdict.word)), "", advice
+        yield from ((1, told[name, reason], "") for reason in verdict.reasons)
+        yield from ((1, "", advice) for advice in verdict.advice)
 
 
 def told_once(texts: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], str]:

@@ -66,7 +66,7 @@ def noise_shape(points: Correspondences, residuals: Array, alike: float) -> Iter
     rms = np.sqrt(np.bincount(index, (residuals**2).sum(axis=1), n_views) / counts)
     usual = float(np.interp(0.25 * (n_views - 1), np.arange(n_views), np.sort(rms)))
     off = (rms > max(ELSEWHERE.poor * usual, least)) & (counts >= FEW_POINTS)
-    if n_views > 2 and off.any():
+    if off.any():
         names = np.array(points.view_names)[off]
         yield (
             1,

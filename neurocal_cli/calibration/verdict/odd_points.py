@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.findings import (
     EXPLAINED,
-    FEW_POINTS,
     FEWEST,
     OUTLIERS,
     TOLD,
@@ -28,7 +27,6 @@ from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.points import Correspondences
 
 _BESIDE = 1.0  # px by which a detected point may lie outside the image
-_SAME = 1e-3  # px by which a copy of a view may differ
 _NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 _SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
 _MOST_POINTS = 400  # most points of a view that are used
@@ -87,7 +85,7 @@ def odd_pixels(points: Correspondences) -> Iterator[Finding]:
 
 def _step(pixels: Array) -> int:
     """Greatest common divisor of all coordinates; 0 if they are not whole numbers."""
-    if len(pixels) < FEW_POINTS or np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
+    if np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
         return 0
     return int(np.gcd.reduce(pixels.astype(np.int64), axis=None))
 
@@ -96,11 +94,8 @@ def _clipped(points: Correspondences) -> Iterator[Finding]:
     fewest = max(FEWEST, OUTLIERS.good * len(points))
     for name, values in zip("uv", points.pixels.T, strict=True):
         for limit in (values.min(), values.max()):
-            alike = values == limit
-            count = int(alike.sum())
-            if count >= fewest:
-                copied = np.column_stack([points.pixels, points.world])[alike]
-                count = len(distinct_rows(copied)[0])  # copies count once
+            alike = np.column_stack([points.pixels, points.world])[values == limit]
+            count = len(distinct_rows(alike)[0])  # copies count once
             if count >= fewest:
                 yield (
                     1,
@@ -152,8 +147,6 @@ def _beyond(pixels: Array, size: Array) -> NDArray[np.bool_]:
 def points_given_twice(points: Correspondences) -> Iterator[Finding]:
     """Findings about views with the points of several images, or several pixels for the same point."""
     _, first, label = np.unique(_own_points(points), return_index=True, return_inverse=True)
-    if len(first) == len(points):
-        return
     seen, _ = distinct_rows(np.column_stack([label, points.pixels]))
     different = np.bincount(label[seen])
     view = points.view_index[first]
@@ -179,12 +172,12 @@ def _own_points(points: Correspondences) -> NDArray[np.intp]:
 
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
     """Names of views with the same pixels as an earlier view, and of views with duplicated rows."""
-    rounded, label = np.round(points.pixels / _SAME), _own_points(points)
-    order = np.lexsort((*rounded.T, label))
-    rounded, label, view = rounded[order], label[order], points.view_index[order]
-    again = (label[1:] == label[:-1]) & (rounded[1:] == rounded[:-1]).all(axis=1)
+    label = _own_points(points)
+    order = np.lexsort((*points.pixels.T, label))
+    seen, label, view = points.pixels[order], label[order], points.view_index[order]
+    again = (label[1:] == label[:-1]) & (seen[1:] == seen[:-1]).all(axis=1)
     doubled = np.bincount(view[1:][again], minlength=points.n_views) > 0
-    of_views = np.split(rounded, np.cumsum(np.bincount(points.view_index))[:-1])
+    of_views = np.split(seen, np.cumsum(np.bincount(points.view_index))[:-1])
     found, known = [], set()
     for name, pixels, twice in zip(points.view_names, of_views, doubled, strict=True):
         key = pixels.tobytes()
@@ -196,8 +189,6 @@ def repeated_views(points: Correspondences) -> tuple[str, ...]:
 
 def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     """Findings about views in which the points are spaced wider or closer than in most views."""
-    if points.n_views < 2:
-        return
     worlds = worlds_by_view(points)
     step, error = _steps(worlds).T
     log = np.log(step)
