@@ -105,11 +105,6 @@ def _positive(field: Field) -> float:
     return value
 
 
-def _upper(H: Array) -> Array:
-    rows, cols = np.triu_indices(H.shape[1])
-    return H[:, rows, cols]
-
-
 _positive_number = {"positive": inline(_positive, number)}
 _CONSTANTS = record(Constants, Keys("theta: number, R: 3x3, t: 2"), inline=True)
 _NET = Keys(
@@ -120,7 +115,7 @@ _NET = Keys(
 _TABLE = Keys(
     "constants: constants, local: nxn, H: nxn, g: nxn, cost: n",
     {"constants": _CONSTANTS},
-    H=lambda table: _upper(table.normal.S),
+    H=lambda table: table.normal.S[(slice(None), *np.triu_indices(table.normal.S.shape[1]))],
     g=lambda table: table.normal.g,
     cost=lambda table: table.normal.cost,
 )

@@ -183,8 +183,6 @@ def views_for_target(fits: Sequence[tuple[Problem, Adjusted]]) -> Sequence[tuple
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
     """At most `most` views, evenly spaced among all: so many determine the target well enough."""
     points = problem.points.of_few_views(most)
-    if points is problem.points:
-        return problem, adjusted
     known = in_pixels(problem, adjusted.state)
     place = [problem.views.names.index(name) for name in points.view_names]
     state = replace(known, R=known.R[place], t=known.t[place])
@@ -254,7 +252,8 @@ class Search:
             known = self.still or self.sizes is not None
             by_fold = partial(self._by_fold, sights := self.sights(), self.offsets)
             if self.still:
-                here = self._of_held_points()
+                (sight,) = sights  # of the only camera with its bends; the points stay as given
+                here = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
             else:
                 here = information_of(sights, len(self.given)).turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
@@ -324,11 +323,6 @@ class Search:
     def _without(self, info: Information) -> float:
         """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
         return evidence_of_given(info.straight() if self.still else info)
-
-    def _of_held_points(self) -> Information:
-        """The quadratic of the only camera with its bends, without the points: they stay as given."""
-        (sight,) = self.sights()
-        return of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
 
     def _by_fold(self, sights: Sequence[Sight], offsets: Array) -> list[WithoutPoses]:
         """The quadratic in the whole offsets of each fold of the views, at a target with these offsets."""
