@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
+from support.campaign import scene as campaign_scene
 from support.distorted import bent_set, through
 from support.scenes import random_flat_set
 
@@ -50,6 +51,15 @@ def test_the_spread_is_the_mean_square_around_what_is_reported() -> None:
         already = 0.0 if value == 0.0 else 1.0 / precision
         assert spread.E[0, 0] == pytest.approx(second / total - already, rel=1e-6)
         assert spread.probability == pytest.approx(1.0 - absent / total, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [950084, 950207])
+def test_a_small_k3_does_not_tell_that_p1_and_p2_are_small(seed: int) -> None:
+    points, truth = campaign_scene(seed)  # p2, or both, are 4.5 to 6 times the typical size
+    found = calibrate(points)
+    assert found.distortion_model == "k1"
+    assert abs(found.intrinsics.u0 - truth.A[0, 2]) < 4 * found.std["u0"]  # 4.9 and 5.2 with one size for all
+    assert abs(found.intrinsics.v0 - truth.A[1, 2]) < 4 * found.std["v0"]
 
 
 @pytest.mark.slow
