@@ -41,8 +41,12 @@ _SKEW = 1  # place of A12 among A's entries
 
 
 @quietly  # starts that run into a pole of the distortion or into the camera's plane lose
-def fit(problem: Problem, options: Options, known: Solution | None = None) -> Solution:
+def fit(
+    problem: Problem, options: Options, known: Solution | None = None, *, more_starts: bool = True
+) -> Solution:
     """Fit a camera and its distortion model from random weights, or from a known fit of the same points.
+
+    Without `more_starts`, the minimum next to that of a pinhole is taken.
 
     Raises `DegenerateGeometryError` if the points do not determine the camera; the message says why.
     """
@@ -53,7 +57,7 @@ def fit(problem: Problem, options: Options, known: Solution | None = None) -> So
     if problem.free_distortion and problem.distortion.model == "rich":
         return _displaced(fit(problem.with_model("fisheye"), options))
     check_points(problem)
-    return _finished(_first_solution(problem, options), options)
+    return _finished(_first_solution(problem, options), options, not more_starts)
 
 
 @quietly

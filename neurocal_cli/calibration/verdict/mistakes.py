@@ -255,10 +255,10 @@ def located(points: Correspondences, camera: Camera) -> Solution | None:
     return solved(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
 
 
-def solved(points: Correspondences, type: int, **given: Any) -> Solution | None:
+def solved(points: Correspondences, type: int, more_starts: bool = True, **given: Any) -> Solution | None:
     """The solution of `problem_for` points that may be wrong; None if there is none."""
     try:
-        return fit(problem_for(points, type, **given), options_for("lm"))
+        return fit(problem_for(points, type, **given), options_for("lm"), more_starts=more_starts)
     except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
         return None
 

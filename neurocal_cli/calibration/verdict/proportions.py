@@ -74,8 +74,9 @@ def proportions(points: Correspondences) -> Proportions | None:
     found = _fitted(points, axes[0], s)
     if found is None or abs(np.log(s)) < STRETCHED_PRINT.poor or not _is_noise(found):
         return None
-    # Boards that hardly differ in tilt may determine a camera only without skew.
+    # Boards that hardly differ in tilt may determine a camera only without skew, or from other starts.
     given = _fitted(points, axes[0], 1.0) or _fitted(points, axes[0], 1.0, skew=False)
+    given = given or _fitted(points, axes[0], 1.0, more_starts=True)
     rms, given_px = (np.inf if one is None else _rms(one) for one in (found, given))
     if not rms**2 < (1.0 - EXPLAINED) * given_px**2 or rms > ERROR.poor * image_diagonal(points):
         return None
@@ -130,11 +131,15 @@ def _linear(points: Correspondences, axes: tuple[int, int]) -> float | None:
     return best
 
 
-def _fitted(points: Correspondences, axis: int, s: float, skew: bool = True) -> Solution | None:
-    """The camera for points with an axis multiplied by s, with or without skew; None if there is none."""
+def _fitted(points: Correspondences, axis: int, s: float, **how: bool) -> Solution | None:
+    """The camera for points with an axis multiplied by s; None if there is none.
+
+    With a wrong s none fits, so other starts would only take long.
+    """
     world = points.world.copy()
     world[:, axis] *= s
-    return solved(replace(points, world=world), 1, skew=skew, distortion=Distortion("k1k2"))
+    stretched = replace(points, world=world)
+    return solved(stretched, 1, **{"more_starts": False, **how}, distortion=Distortion("k1k2"))
 
 
 def _refined(found: Solution, axes: tuple[int, int]) -> float:
