@@ -11,7 +11,7 @@ dictionaries.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -129,20 +129,28 @@ def candidates(look: Sequence[View]) -> Array:
 def looks_at(grey: NDArray[np.uint8]) -> Iterator[list[View]]:
     """Views of an image in which markers are looked for, one list after the other.
 
-    A large image is looked at as a whole at a smaller scale, and then where it may show smaller details.
+    A large image is looked at as a whole at a smaller scale, and then where it may show smaller details. A
+    small one is enlarged there.
     """
     scaled = [View(grey, 1.0)]
     while max(scaled[-1].image.shape) > _LONGEST:
         scaled.append(_scaled(scaled[-1], 0.5))
     yield scaled[-1:]
     for coarse, fine in pairwise(scaled[::-1]):
-        factor = round(1 / fine.scale)
-        yield [
-            View(np.ascontiguousarray(fine.image[v, u]), fine.scale, (factor * u.start, factor * v.start))
-            for v, u in dense_parts(Level(grey_levels(coarse.image), 2 * factor))
-        ]
+        yield _parts(fine, dense_parts(Level(grey_levels(coarse.image), round(1 / coarse.scale))))
     if max(grey.shape) <= SMALL:
-        yield [_scaled(scaled[0], _ENLARGED)]
+        doubled = dense_parts(Level(grey_levels(grey), 2))
+        dense = ([slice(x.start // 2, x.stop // 2) for x in both] for both in doubled)
+        yield [_scaled(part, _ENLARGED) for part in _parts(scaled[0], dense)]
+
+
+def _parts(view: View, parts: Iterable[Sequence[slice]]) -> list[View]:
+    """Parts of a view of a whole image, by their rows and columns."""
+    factor = round(1 / view.scale)
+    return [
+        View(np.ascontiguousarray(view.image[v, u]), view.scale, (factor * u.start, factor * v.start))
+        for v, u in parts
+    ]
 
 
 def _detected(detector: Any, look: Sequence[View]) -> tuple[NDArray[np.int64], Array, Array]:
@@ -167,7 +175,7 @@ def _scaled(view: View, scale: float) -> View:
     size = [max(1, round(scale * length)) for length in view.image.shape[::-1]]
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LANCZOS4
     image = np.asarray(cv2.resize(view.image, size, interpolation=how), dtype=np.uint8)
-    return View(image, scale * view.scale)
+    return View(image, scale * view.scale, view.origin)
 
 
 def _detector(dictionary: str, first: int, count: int, border: int):  # type: ignore[no-untyped-def]
