@@ -70,6 +70,7 @@ class Contest:
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
     n: float  # effective number of equations beyond the unknowns
     of_outliers: bool = False  # whether the first one explains the outliers, which are included
+    remains: bool = True  # whether the points that are no outliers show it as well
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
 
     @property
@@ -379,8 +380,8 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     by_poses = BIASED.grade(told.moved_poses) if moved else 0
     if by_poses:
         grade = max(grade, 1 + int(by_poses > 1 and found.explained > EXPLAINED))
-    # What differs from view to view is in the std.
-    if not found.weights.size:
+    # Outliers were left out of the calibration, and what differs from view to view is in the std.
+    if not contest.remains or not found.weights.size:
         return grade, reason
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0

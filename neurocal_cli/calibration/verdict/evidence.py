@@ -290,7 +290,8 @@ class Evidence:
         held = self._contest_at(replace(m, views=views, state=state))
         if held is None or not held.of_all_views:
             return kept
-        return replace(held, of_outliers=True)
+        remains = kept is not None and any(one.rival is held.causes[0].rival for one in kept.causes)
+        return replace(held, of_outliers=True, remains=remains)
 
     def _contest_at(self, m: Minimum, free: NDArray[np.bool_] | None = None) -> Contest | None:
         """The contest at a minimum with these parameters free, by default those of the calibration."""

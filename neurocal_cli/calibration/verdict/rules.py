@@ -21,6 +21,7 @@ from neurocal_cli.calibration.verdict.evidence import Evidence, has_points, view
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     CORRELATED,
+    DISPLACED,
     ELSEWHERE,
     ERROR,
     EXACT,
@@ -170,7 +171,10 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"the rms reprojection error of {rmse:.3g} px is large",
         "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
     )
-    if rmse > EXACT * spread:
+    # Given poses that are wrong leave such errors as well, so they are not excused.
+    flexes = calibration.target is not None and calibration.type != 4 and _by_flexing(e, diagonal)
+    unexcused = rmse > EXACT * spread and not flexes
+    if unexcused:
         yield (
             CONTRADICTION.grade(e.contradiction),
             f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
@@ -193,7 +197,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "flat",
         )
         yield (
-            CORRELATED.grade(e.correlation) if rmse > EXACT * spread and not _is_common_noise(e) else 0,
+            CORRELATED.grade(e.correlation) if unexcused and not _is_common_noise(e) else 0,
             f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
             "model or the target does not fit",
             "try another --distortion, or measure the target",
@@ -217,6 +221,12 @@ def _explains(calibration: Calibration, e: Evidence) -> bool:
     """Whether causes are known that explain the error."""
     error = calibration.rmse_px / image_diagonal(calibration.points)
     return e.contest is not None and explains(e.contest, e.contradiction, error)
+
+
+def _by_flexing(e: Evidence, diagonal: float) -> bool:
+    """Whether a board that bends from view to view may cause the error above the noise floor."""
+    above = float(np.sqrt(max(e.calibration.rmse_px**2 - e.precision_px**2, 0.0)))
+    return above < DISPLACED.good * diagonal and not _is_unknown(e)
 
 
 def _is_unknown(e: Evidence) -> bool:
