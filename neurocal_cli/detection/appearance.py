@@ -49,7 +49,9 @@ _LABELLED = 1 / 8  # of the marks, beside which there may be ink, or which are p
 _OFF = 0.1  # px, from where those around a mark predict it
 _SIZES = 0.05  # px rms, of the radius from a smooth change
 _LONG = 0.06  # px, of two periods of most outlines by the angle, beyond noise
-_CORNERED = 0.012  # px, of three and more periods of the mean outline, beyond what the marks differ by
+# px, of three and more periods of the mean outline, beyond what the marks differ by; the latter is for
+# described boards, which may be drawn in whole pixels.
+_CORNERED = 0.012, 0.05
 _INKS = 0.013  # rms, of the share of the paper's light from a smooth change
 _MIXED = 0.007  # rms, of the light by the distance from that of a disc or a ring
 _SIGNED = 0.06  # spread of the light within most marks beyond that around them
@@ -125,7 +127,7 @@ def departure_from_circles(light: Image, places: Array, centre: Array, area: Arr
     long = np.sqrt(max(power[0] - power[1:].mean(), 0.0))  # noise is alike in all
     corners = periods[:, 1:].mean(axis=0)
     noise = np.sqrt((np.abs(periods[:, 1:] - corners) ** 2).mean(axis=0) / len(periods))
-    cornered = float((np.abs(corners) / np.hypot(noise, _CORNERED)).max())
+    cornered = float((np.abs(corners) / np.hypot(noise, _CORNERED[described])).max())
     blank = rings[half] + between * _STEP * radius + _BLUR * blur
     clear = (rings > blank) & (rings < apart - blank)
     at = places[:, None, None] + shift[clear]

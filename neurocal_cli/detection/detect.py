@@ -15,7 +15,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.measuring import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.grey import grey_image, negative
+from neurocal_cli.detection.grey import blurred, grey_image, negative
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located, identify
 from neurocal_cli.detection.markers.locate import check_measured_spacing, locate
@@ -136,16 +136,17 @@ def detect_points(
         # The response is that of the light, not of its negative.
         image, gamma = negative(image if gamma is None else linearised(image, gamma)), None
     identified = _identified(image, board, grids)
-    located = identified.located
-    if points == "vertices" and any(one.grid.paired for one in located):
-        raise NoBoardError(
-            "the tags have no squares at their corners, so these are no vertices; leave out --points, to "
-            "measure the mid-points of their edges"
-        )
-    measured = tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
-    count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
+    measured = _all_measured(image, identified.located, points, gamma)
     every = [one.vertex_ids() if points == "vertices" else one.midpoint_ids() for one in board.planes]
-    if count < min(_FEWEST, sum(map(len, every))):
+    fewest = min(_FEWEST, sum(map(len, every)))
+    if not is_plain(board) and sum(len(one.kind) for one in measured) < fewest:
+        # The edges of a board that is drawn in whole pixels lack the blur which tells their places.
+        image = blurred(image)
+        identified = _identified(image, board, grids)
+        measured = _all_measured(image, identified.located, points, gamma)
+    located = identified.located
+    count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
+    if count < fewest:
         if not rejected:
             raise NoBoardError(f"only {count} points of the board are seen; show more of it")
         share = f"{count} of {count + rejected} points"
@@ -171,6 +172,17 @@ def detect_points(
         measured,
         identified.notes,
     )
+
+
+def _all_measured(
+    image: NDArray[np.generic], located: tuple[Located, ...], points: Points, gamma: float | None
+) -> tuple[Measured, ...]:
+    if points == "vertices" and any(one.grid.paired for one in located):
+        raise NoBoardError(
+            "the tags have no squares at their corners, so these are no vertices; leave out --points, to "
+            "measure the mid-points of their edges"
+        )
+    return tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
 
 
 def is_inverted(board: Board) -> bool:

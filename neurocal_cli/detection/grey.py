@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import InputError
 
 _EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of noise-free images
+_DRAWN = 0.7  # px, the blur of drawn edges
 _TO_GREY = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}  # by the number of channels
 
 
@@ -69,6 +70,11 @@ def negative(image: NDArray[Any]) -> NDArray[Any]:
     """Exchange light and dark in a grey image."""
     brightest = np.iinfo(image.dtype).max if image.dtype.kind == "u" else image.max()
     return np.asarray(brightest - image)
+
+
+def blurred(image: NDArray[Any]) -> NDArray[Any]:
+    """Blur the edges of a grey image that is drawn in whole pixels, so that they have places between them."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), _DRAWN))
 
 
 def eight_bits(image: NDArray[np.generic]) -> NDArray[np.uint8]:

@@ -23,6 +23,7 @@ from neurocal_cli.detection.circles.pattern import seen_circles
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.errors import InputError
+from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.board_kinds import CirclePlane
 
@@ -306,3 +307,15 @@ def test_thousands_of_marks_do_not_fill_the_memory() -> None:
     finally:
         tracemalloc.stop()
     assert peak < 20e6
+
+
+@pytest.mark.parametrize("radius", [8, 14, 30])
+def test_described_circles_may_be_drawn_in_whole_pixels(radius: int) -> None:
+    drawn = np.full((960, 1280), 255, np.uint8)
+    places = 3 * radius * np.array([(x, y) for y in range(7) for x in range(6)]) + 150
+    for place in places:
+        cv2.circle(drawn, place.tolist(), radius, 0, -1)
+    found = detect_points(drawn, short_board(f"circles:6x7:{3 * radius}:{2 * radius}"))
+    assert len(found.ids) == 42
+    away = np.abs(found.pixels[:, None] - places).max(axis=2)
+    assert away.min(axis=1).max() < 0.1

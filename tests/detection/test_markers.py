@@ -41,6 +41,7 @@ from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.detection.wide_lens import Flattening, WideLens
 from neurocal_cli.errors import InputError
+from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import TagPlane
 from neurocal_cli.observations.marked_cells import Print, marked_cells, printed_rectangles
@@ -635,3 +636,12 @@ def test_a_vertex_has_its_own_id(seed: int) -> None:
     every = np.array(list(places.values()))
     apart = np.hypot(*(every[:, None] - every).transpose(2, 0, 1))
     assert off.max() < 0.5 * apart[apart > 0].min()
+
+
+def test_a_board_that_is_drawn_in_whole_pixels_is_measured() -> None:
+    """Its edges have no blur, as in the file that is printed."""
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    drawn = cv2.aruco.CharucoBoard((8, 6), 30.0, 22.0, words).generateImage((1280, 960), marginSize=60)
+    found = detect_points(drawn, short_board("charuco:8x6:30:22:DICT_5X5_100"), "vertices")
+    assert len(found.ids) == 35
+    assert np.abs(found.pixels - (found.world[:, :2] / 30 * 140 + [219.5, 199.5])).max() < 0.1
