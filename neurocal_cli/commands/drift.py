@@ -67,6 +67,11 @@ def drift(old: str, new: str, plots: Plots, as_json: bool) -> None:
         rigs = find_rig_drift(before, after)
         found, limit, different = rigs.cameras, rigs.limit, rigs.different
         sizes = {name: before.cameras[name].image_size or after.cameras[name].image_size for name in found}
+        if rigs.twice:
+            note(
+                f"errors of given cameras, which both rigs share, count twice ({', '.join(rigs.twice)}), so "
+                "a small change may be missed; write both rigs without --lean"
+            )
         show.rig_drift_report(rigs).print(as_json)
     elif isinstance(before, Rig) or isinstance(after, Rig):
         raise InputError("one file is a rig and the other one camera; give two of a kind")

@@ -58,6 +58,8 @@ class RigDrift:
     poses: Mapping[str, PoseDrift]  # of all cameras but one, relative to it
     unit: str  # of lengths
     reference: str  # the camera to which the poses are relative
+    # Cameras that were given as the old rig has them, whose errors count twice, as a rig lacks its points.
+    twice: tuple[str, ...] = ()
 
     @property
     def limit(self) -> float:
@@ -120,11 +122,12 @@ def moved_since(rig: Rig, seen: Mapping[str, Calibration]) -> RigDrift | None:
 
 def _of_poses(old: Rig, new: Rig, cameras: Mapping[str, Drift]) -> RigDrift:
     known = differences(old, new)
+    twice = () if has_points(old) and has_points(new) else tuple(_alike(old, new))
 
     def seen_from(reference: str) -> RigDrift:
         others = [name for name in new.cameras if name != reference]
         poses = {name: find_pose_drift(old, new, name, reference, known) for name in others}
-        return RigDrift(cameras, poses, old.unit, reference)
+        return RigDrift(cameras, poses, old.unit, reference, twice)
 
     found = seen_from(new.first)
     if len(found.moved) <= len(found.poses) / 2:
@@ -183,7 +186,7 @@ def differences(old: Rig, new: Rig) -> Differences:
     Where a rig was written without its points, what they share is not known, and counts twice.
     """
     names = [list(rig.cameras) for rig in (old, new)]
-    alike = [name for name, camera in new.cameras.items() if _is_given(camera, old.cameras.get(name))]
+    alike = _alike(old, new)
     if not (alike and has_points(old) and has_points(new)):
         return lambda *pair: _covariance(old.pair(*pair)) + _covariance(new.pair(*pair))
     before, after = fitted(old), fitted(new)
@@ -210,11 +213,16 @@ def differences(old: Rig, new: Rig) -> Differences:
     return between
 
 
-def _is_given(camera: Calibration, old: Calibration | None) -> bool:
-    """Whether a camera was given, with the parameters that it has in the old rig."""
-    if old is None or not camera.given_names:
-        return False
-    return camera.intrinsics == old.intrinsics and camera.camera.distortion == old.camera.distortion
+def _alike(old: Rig, new: Rig) -> list[str]:
+    """The cameras that were given to the new rig with the parameters that they have in the old one."""
+    both = {name: (camera, old.cameras[name]) for name, camera in new.cameras.items() if name in old.cameras}
+    return [
+        name
+        for name, (camera, before) in both.items()
+        if camera.given_names
+        and camera.intrinsics == before.intrinsics
+        and camera.camera.distortion == before.camera.distortion
+    ]
 
 
 def _steps_of(fit: RigFit, first: int, second: int) -> Array:

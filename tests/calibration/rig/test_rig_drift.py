@@ -108,6 +108,8 @@ def test_cameras_that_both_rigs_were_given_do_not_make_them_different_or_alike()
         ratios.append(np.append(found.turn / found.turn_std, found.shift / found.shift_std))
         # Without the points, it is not known what they share.
         apart = find_pose_drift(old.lean, new.lean, "right")
+        assert find_rig_drift(old, new).twice == ()
+        assert find_rig_drift(old.lean, new.lean).twice == ("left", "right")
         shares.append(found.shift_std[2] / apart.shift_std[2])
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.3
     assert max(shares) < 0.3
