@@ -205,7 +205,7 @@ def parsed(words: Sequence[str]) -> click.Context:
 
     command = command_of(words)
     n_names = 2 if words[0] == "lens" else 1
-    parent = click.Context(neurocal, info_name="neurocal")
+    parent = click.Context(neurocal, info_name="neurocal", **neurocal.context_settings)
     parent.meta[TYPED] = tuple(words)
     return command.make_context(" ".join(words[:n_names]), list(words[n_names:]), parent=parent)
 

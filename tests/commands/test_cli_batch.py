@@ -307,3 +307,15 @@ def test_dask_gives_the_same_bytes(tmp_path: Path, scheduler: str) -> None:
         subprocess.run([*words, *options, "-o", str(tmp_path / name)], capture_output=True, check=True)
         assert files_of(tmp_path / "own") == files_of(tmp_path / name), name
     assert len(files_of(tmp_path / "own")) == 90
+
+
+def test_jobs_leave_the_help_of_their_commands_as_it_is() -> None:
+    """Click keeps a command's help option as it was when the command was first parsed."""
+    words = ["calibrate", str(SAMPLES / "points.csv")]
+    code = f"""if True:
+        from neurocal_cli.commands.batch_jobs import command_of, parsed
+        context = parsed({words!r})
+        print(command_of({words!r}).get_help_option(context).opts)
+    """
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "['-h', '--help']"
