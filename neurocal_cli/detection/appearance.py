@@ -62,7 +62,7 @@ def departure_from_circles(light: Image, places: Array, centre: Array, area: Arr
     """How far marks (N,) of an area [px^2] at places (N, 2) of a board are from circles on blank paper.
 
     What they depart by is added up in squares, over what grids of circles hardly depart by. Some marks of a
-    `described` board may be hidden.
+    `described` board may be hidden, and its outlines be drawn in whole pixels.
     """
     flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
     start, steps = predicted(places, places, centre, flattening, itself=False)

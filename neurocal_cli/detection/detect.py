@@ -177,6 +177,7 @@ def detect_points(
 def _all_measured(
     image: NDArray[np.generic], located: tuple[Located, ...], points: Points, gamma: float | None
 ) -> tuple[Measured, ...]:
+    """The points of each located plane; raises `NoBoardError` for vertices that the tags do not have."""
     if points == "vertices" and any(one.grid.paired for one in located):
         raise NoBoardError(
             "the tags have no squares at their corners, so these are no vertices; leave out --points, to "
