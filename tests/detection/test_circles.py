@@ -230,6 +230,19 @@ def test_a_part_of_the_board_is_known_by_the_paper_around_it(form: str) -> None:
         detect_points(pale, scene.board)
 
 
+def test_circles_cut_off_by_the_image_are_left_out() -> None:
+    scene = marked_scene(
+        plane_of("circles:8x6:30:18"), 7, square=70.0, tilt=60.0, size=(640, 480), shift=(100, -60)
+    )
+    picture = taken(scene, 7, 3)
+    found = detect_points(picture.image, scene.board)
+    _, squared = errors(found, picture)
+    assert len(squared) >= 36
+    assert squared.max() < 16
+    assert (found.pixels >= 0).all()  # three cut ones lie outside
+    assert (found.pixels <= np.array(scene.camera.image_size) - 1).all()
+
+
 def test_circles_that_are_partly_hidden_make_the_others_no_less_certain() -> None:
     scene = marked_scene(plane_of("asymmetric_circles:4x11:20:16"), 9, square=14.0, noise=1.0)
     picture = taken(scene, 9)

@@ -214,7 +214,7 @@ def measure_circles(
         undo = False
         centre = found.map.at(places) + fit.values[:, :2]
         mapped, departure = _mapped(raw, found, places, centre, fit, some)
-        good = is_reliable(fit, departure)
+        good = is_reliable(fit, departure) & _whole(found.map, places, radius, light.shape)
         moved = np.sqrt(((mapped.map.at(places) - found.map.at(places)) ** 2).mean())
         found = mapped
         # The first blur may be far from the true one, which is_reliable does not allow.
@@ -249,6 +249,12 @@ def _band(
     darkest, lightest = int(profile[:within].argmin()), within + int(profile[within:].argmax())
     back = profile[: darkest + 1].max() - profile[darkest], profile[lightest] - profile[lightest:].min()
     return float(rho[darkest]) if back[0] > _BACK else 0.0, float(rho[lightest]) if back[1] > _BACK else room
+
+
+def _whole(at: SmoothMap, places: Array, radius: float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which outlines are within the image: a part of one does not tell its radius from its place."""
+    outline = at.at(places[:, None] + radius * _CIRCLE)
+    return np.asarray(((outline >= 0) & (outline <= np.array(shape[::-1]) - 1)).all(axis=(1, 2)))
 
 
 def _missed(plane: CirclePlane, found: NDArray[np.int64]) -> NDArray[np.int64]:
