@@ -47,16 +47,12 @@ from neurocal_cli.adjustment.normal_equations import Arrowhead, Covariance, unit
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.camera.state import CameraState
 
-# These limits decide only about warnings; no result depends on them.
-_POOR = 0.05  # std of a parameter over its value (for the centre: over alpha)
-_POOR_THETA = 0.02  # rad
 _TOLD_APART = 2.0  # standard deviations from which on a coefficient differs significantly from 0
 
 
@@ -145,39 +141,21 @@ def with_scale(std: Array, t: Array, relative: float) -> Array:
     return np.asarray(np.hypot(std, relative * np.abs(np.concatenate([np.zeros_like(t), t], axis=1))))
 
 
-def parameter_warnings(
-    intrinsics: Intrinsics, distortion: Distortion, std: Mapping[str, float], model_chosen: bool
+def coefficient_warnings(
+    distortion: Distortion, std: Mapping[str, float], model_chosen: bool
 ) -> tuple[str, ...]:
-    """Warn of poorly determined parameters, and of coefficients that are not significantly different from 0.
+    """Warn of coefficients that are not significantly different from 0.
 
-    Alpha alone means nothing in models with xi. A model selected by cross-validation may well have a
-    coefficient that is not significant, so no warning is given then.
+    A model selected by cross-validation may well have such a coefficient, so no warning is given then.
     """
-    alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
-    limits = {
-        "alpha_u": np.inf if distortion.model in WITH_XI else _POOR * intrinsics.alpha_u,
-        "alpha_v": np.inf if distortion.model in WITH_XI else _POOR * intrinsics.alpha_v,
-        "u0": _POOR * alpha,
-        "v0": _POOR * alpha,
-        "theta": _POOR_THETA,
-    }
-    poor = [f"{name} (std {std[name]:.2g})" for name in INTRINSIC_NAMES if std[name] > limits[name]]
     noise = [
         f"{name} ({k:.2g} +- {std[name]:.2g})"
         for name, k in zip(coefficient_names(distortion.model), distortion.coefficients, strict=True)
         if not model_chosen and name[0] in "kpst" and 0 < abs(k) < _TOLD_APART * std[name]
     ]
-    warnings = []
-    if poor:
-        warnings.append(
-            f"poorly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
-            "the target more, or give known parameters (--no-skew, --type 2)"
-        )
-    if noise:
-        warnings.append(
-            f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion"
-        )
-    return tuple(warnings)
+    if not noise:
+        return ()
+    return (f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion",)
 
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty

@@ -9,10 +9,10 @@ import numpy as np
 
 from neurocal_cli.adjustment.board.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
 from neurocal_cli.adjustment.covariance import (
+    coefficient_warnings,
     covariance_by_camera,
     entry_covariance,
     parameter_covariance,
-    parameter_warnings,
     pose_std,
     with_scale,
 )
@@ -93,7 +93,7 @@ def calibration_of(
         target_stretched=known.stretched,
         lens_choice=solution.model_errors or {},
         warnings=(
-            *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
+            *coefficient_warnings(state.distortion, std, chosen or solution.ambiguity is not None),
             *_lens_warnings(solution),
             *_view_warnings(solution),
             *_rejection_warnings(rejected, len(problem.points)),

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.covariance import (
+    coefficient_warnings,
     parameter_covariance,
-    parameter_warnings,
     pose_std,
     with_scale,
 )
@@ -136,8 +136,8 @@ def _intrinsic_changes(fit: RigFit, found: Covariance, side: int, intrinsics: In
     chosen = bool(given.lens_choice)
     if given.std.keys() >= std.keys():
         alone = Distortion(camera.model, given.distortion)
-        before += parameter_warnings(given.intrinsics, alone, given.std, chosen)
-    now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
+        before += coefficient_warnings(alone, given.std, chosen)
+    now = coefficient_warnings(camera.distortion, std, chosen)
     return {
         "intrinsics": intrinsics,
         "std": std,
