@@ -93,9 +93,10 @@ def test_no_view_is_left_out_of_a_board_whose_sides_lean() -> None:
 @pytest.mark.slow
 def test_no_view_is_left_out_if_all_lack_the_same_coefficients() -> None:
     points, _ = campaign_scene(204)
-    for model in ("eucm", "k1k2p1p2"):
+    for model in ("none", "eucm", "double_sphere", "k1k2p1p2"):
         named = calibrate(points, distortion=model)
         assert not named.rejected.views
+        assert not any(some in " ".join(named.verdict.reasons) for some in ("two cameras", "rolling", "blur"))
         assert "distortion model is too simple" in named.verdict.reasons[0]
     assert not calibrate(points, distortion="plumb-line").rejected.views
 

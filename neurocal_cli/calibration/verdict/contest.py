@@ -14,6 +14,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.prior import STRETCH
 from neurocal_cli.adjustment.cross_validation import Minimum
+from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.effects import another_lens, common, field, no_pupil
@@ -121,9 +122,11 @@ def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False
             return held
         lin = at_minimum(field, another_lens)
         between = [one.pattern != "all" and not one.rival.of_board for one in held.causes]
-        told = [one.evidence for one in held.causes][: between.index(True) + 1] if any(between) else [np.inf]
-        if estimates(lin, held.n, (ANOTHER_LENS,), sum(told) + LEVEL):
-            held = _held(lin, worth, (ANOTHER_LENS,))  # what it leaves of other causes would be guessed
+        if any(between):
+            told = sum(one.evidence for one in held.causes[: between.index(True) + 1])
+            lenses = estimates(lin, held.n, (ANOTHER_LENS,))
+            if any((_fitted(lin, one, held.n) or one).evidence > told + LEVEL for one in lenses):
+                held = _held(lin, worth, (ANOTHER_LENS,))  # what it leaves of others would be guessed
         smooth, beside = estimates(lin, held.n, (NEIGHBOURS,)), lin
         for one in held.causes:
             beside = including(beside, one)
@@ -159,7 +162,7 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
         if of_two is not None:
             alike = min(alike, correlation(lin.views, of_two))
         n = effective_number(n, alike)
-        fits = [(one, _fitted(lin, one)) for one in estimates(lin, n, rivals)]
+        fits = [(one, _fitted(lin, one, n)) for one in estimates(lin, n, rivals)]
         fitted = {one.rival.cause for one, fit in fits if fit is not None}
         ranking = sorted((fit or one for one, fit in fits), key=lambda one: -one.evidence)
     share = n / lin.spare
@@ -235,18 +238,28 @@ def _best(
     return best[:1] if best[0] is ranking[0] else best
 
 
-def _fitted(lin: Linearised, one: Estimate) -> Estimate | None:
+def _fitted(lin: Linearised, one: Estimate, n: float) -> Estimate | None:
     """Fit a cause that looks different beyond the linear range; None for others.
 
-    Two cameras that are far apart are fitted, and lenses and given values that explain much.
+    Two cameras that are far apart are fitted, and lenses and given values that explain much. For a lens of
+    another kind, `rational` is. `n` is the effective number of equations beyond the unknowns.
     """
-    views, state = lin.views, lin.state
+    views, state, free = lin.views, lin.state, lin.free
     of_given = one.rival.of_given and views.n_views >= DETERMINE and not state.square
     if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > NEAR:
-        free, member = lin.free, one.weights > 0.5
+        member = one.weights > 0.5
         groups = [np.flatnonzero(member), np.flatnonzero(~member)]
     elif (of_given or one.rival in RICHER_LENSES) and one.explained > _MUCH:
         free = np.append(lin.free, np.flatnonzero(one.rival.steps_at(lin).any(axis=1)))
+        groups = [np.arange(views.n_views)]
+    elif one.rival is ANOTHER_LENS and lin.alphas_free and state.model != "rich":
+        from neurocal_cli.camera.nearest_camera import similar_states
+
+        similar = similar_states(state, "rational", farthest_angle(views, state))
+        if not similar:
+            return None
+        state = similar[0]
+        free = np.concatenate([free[free < 5], 5 + np.arange(len(state.k))])
         groups = [np.arange(views.n_views)]
     else:
         return None
@@ -255,11 +268,11 @@ def _fitted(lin: Linearised, one: Estimate) -> Estimate | None:
         adjust(views.subset(some).batches, state.of_views(some), moving, lin.free_poses, NEARBY)
         for some in groups
     ]
-    cost, left = sum(float(fit.cost.sum()) for fit in fits), (1.0 - one.explained) * lin.cost
+    cost, left = sum(float(fit.cost.sum()) for fit in fits), n * one.noise
     if not 0 < cost < left:
         return one
-    n, camera, amounts = left / one.noise, one.camera, one.amounts
-    if len(fits) == 1:
+    camera, amounts = one.camera, one.amounts
+    if len(fits) == 1 and one.rival is not ANOTHER_LENS:
         step, camera = fits[0].state.entries[0] - lin.state.entries[0], camera.copy()
         of_entries = lin.free < 5
         camera[of_entries] = step[lin.free[of_entries]]

@@ -179,8 +179,10 @@ class Evidence:
     @property
     def noise(self) -> tuple[Finding, ...]:
         """Residuals unlike measurement noise, or that contradict the stated noise."""
-        shape = noise_shape(self.points, self._residuals(), self.correlation)
-        return (*self.stated, *self._survey(), *shape)
+        found = (*self.stated, *self._survey())
+        if self.contest is not None and self.contest.of_all_views:
+            return found  # their shape follows from this cause
+        return (*found, *noise_shape(self.points, self._residuals(), self.correlation))
 
     @property
     def lacking(self) -> tuple[str, float]:

@@ -25,6 +25,7 @@ from neurocal_cli.calibration.verdict.findings import (
     ELSEWHERE,
     ERROR,
     EXACT,
+    EXPLAINED,
     LEVEL,
     ROUNDED,
     SHARE,
@@ -125,14 +126,17 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
 def _causes_or_errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     """Findings about the causes of errors, or about the errors if no known cause explains them.
 
-    A cause is as grave as the errors, even if it hardly biases the camera.
+    A cause is as grave as the errors, even if it hardly biases the camera; if it explains most of them, as
+    large std, which follow from it.
     """
     errors = [finding for finding in _errors(calibration, e) if finding[0]]
-    told, explained = list(e.of_given), False
+    told, explained, follow = list(e.of_given), False, list(errors)
     if e.contest is not None and _explains(calibration, e):
         told += causes(e.contest, calibration, any(grade for grade, *_ in told))
         explained = any(grade for grade, *_ in told)
-    worst = max((grade for grade, *_ in errors if explained), default=0)
+        if e.contest.explained >= EXPLAINED:
+            follow += _uncertain(calibration, e)
+    worst = max((grade for grade, *_ in follow if explained), default=0)
     for grade, reason, advice in told:
         yield (max(grade, worst) if grade else 0), reason, advice
     if not explained:
