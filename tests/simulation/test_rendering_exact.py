@@ -183,7 +183,7 @@ def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 30) ->
         a, b = (point @ (R @ np.array(axis)) / plane.square for axis in (plane.x_axis, plane.y_axis))
         low_a, high_a, low_b, high_b = target.paper_box
         on = (own > 0) & (own < depth) & (a > low_a) & (a < high_a) & (b > low_b) & (b < high_b)
-        low_a, high_a, low_b, high_b = target.pattern_box
+        low_a, high_a, low_b, high_b = target.printed.box
         black = (np.floor(a) + np.floor(b)) % 2 == (0 if target.first_black else 1)
         black &= (a > low_a) & (a < high_a) & (b > low_b) & (b < high_b)
         light[on] = np.where(black, target.black, target.white)[on]

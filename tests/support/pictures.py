@@ -83,17 +83,15 @@ class Target(plain.Target):
                 raise InputError("reach and margin must not be negative")
 
     @property
-    def pattern_box(self) -> tuple[float, float, float, float]:
-        """Ends of the pattern: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
+    def squares(self) -> tuple[float, float, float, float]:
+        """Ends of a plain chessboard: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
         reach, plane = self.reach, self.plane
-        if self.printed is not None:
-            return self.printed.box
         return -reach.x_low, plane.cols - 1 + reach.x_high, -reach.y_low, plane.rows - 1 + reach.y_high
 
     @property
     def paper_box(self) -> tuple[float, float, float, float]:
-        """Ends of the paper, like `pattern_box`."""
-        x_low, x_high, y_low, y_high = self.pattern_box
+        """Ends of the paper, like `squares`."""
+        x_low, x_high, y_low, y_high = self.printed.box
         margin = self.margin
         return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
 

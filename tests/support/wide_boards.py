@@ -101,7 +101,7 @@ def _about_axis(roll: float) -> Array:
 def _framed(scene: Scene, framing: str) -> bool:
     """Whether the whole pattern, or a part of the board, is in the image and its circle."""
     target = scene.targets[0]
-    x_low, x_high, y_low, y_high = target.pattern_box
+    x_low, x_high, y_low, y_high = target.printed.box
     a, b = np.meshgrid(np.linspace(x_low, x_high, 41), np.linspace(y_low, y_high, 41))
     matrix = scene.plane_to_camera(target)
     points = np.stack([a, b], axis=-1) @ matrix[:, :2].T + matrix[:, 2]

@@ -7,8 +7,6 @@ straight edge is known; a cell with more than one edge is divided once more.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,61 +81,14 @@ class BoardLayer:
         if not at.size:
             return Cover(alpha, light, depth, edges)
         a, b, w = a[at], b[at], w[at]
-        au, av, bu, bv = self.slopes(rays.some(at), a, b, w)
-        alpha[at], ink, edges[at] = self._printed(a, b, (au, av, bu, bv), cell, slack)
+        slopes = au, av, bu, bv = self.slopes(rays.some(at), a, b, w)
+        across, at_side = _ends(a, au, av, (x_low, x_high), cell, slack)
+        down, at_end = _ends(b, bu, bv, (y_low, y_high), cell, slack)
+        ink, inner = self.target.printed.inked(a, b, slopes, cell, slack)
+        alpha[at], edges[at] = across * down, inner + at_side + at_end
         light[at] = self.target.white * alpha[at] - (self.target.white - self.target.black) * ink
         depth[at] = np.where(alpha[at] > 0, 1 / w, np.inf)
         return Cover(alpha, light, depth, edges)
-
-    def _printed(
-        self, a: Array, b: Array, slopes: tuple[Array, Array, Array, Array], cell: float, slack: float
-    ) -> tuple[Array, Array, NDArray[np.int8]]:
-        """Shares of cells with paper and with ink, and the number of edges in each."""
-        au, av, bu, bv = slopes
-        paper, printed = self.target.paper_box, self.target.printed
-        if printed is not None:
-            ends = _ends(a, au, av, paper[:2], cell, slack), _ends(b, bu, bv, paper[2:], cell, slack)
-            ink, edges = printed.inked(a, b, slopes, cell, slack)
-            return ends[0][0] * ends[1][0], ink, edges + ends[0][1] + ends[1][1]
-        pattern = self.target.pattern_box
-        along_x = _axis(a, au, av, pattern[:2], paper[:2], cell, slack)
-        along_y = _axis(b, bu, bv, pattern[2:], paper[2:], cell, slack)
-        sign = 1.0 if self.target.first_black else -1.0
-        ink = 0.5 * (along_x.pattern * along_y.pattern + sign * along_x.signed * along_y.signed)
-        return along_x.paper * along_y.paper, ink, along_x.edges + along_y.edges
-
-
-class _Axis(NamedTuple):
-    """Averages over cells along one axis of a board."""
-
-    paper: Array  # inside the paper
-    pattern: Array  # inside the pattern
-    signed: Array  # +1 in even, -1 in odd squares of the pattern, 0 outside
-    edges: NDArray[np.int8]
-
-
-def _axis(
-    a: Array,
-    au: Array,
-    av: Array,
-    pattern: tuple[float, float],
-    paper: tuple[float, float],
-    cell: float,
-    slack: float,
-) -> _Axis:
-    steepness = np.hypot(au, av)
-    to_pixels = 1 / steepness
-    nu, nv = au * to_pixels, av * to_pixels
-    # Lines at the pattern's ends are borders; only lines strictly between them change the colour.
-    line = np.clip(np.rint(a), np.floor(pattern[0]) + 1, np.ceil(pattern[1]) - 1)
-    beyond, crossed = half_plane((a - line) * to_pixels, nu, nv, cell, slack)
-    sign = 1 - 2 * (line - 2 * np.floor(0.5 * line))
-    inside, at_end = _ends(a, au, av, pattern, cell, slack)
-    edges = crossed.astype(np.int8) + at_end
-    if paper == pattern:
-        return _Axis(inside, inside, inside * sign * (2 * beyond - 1), edges)
-    covered, at_border = _ends(a, au, av, paper, cell, slack)
-    return _Axis(covered, inside, inside * sign * (2 * beyond - 1), edges + at_border)
 
 
 def _ends(

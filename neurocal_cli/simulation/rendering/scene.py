@@ -145,13 +145,14 @@ class Circles:
         return Inked(ink, crossed.astype(np.int8))
 
 
-def pattern_of(plane: Plane) -> Rectangles | Circles | None:
-    """What is printed on a plane; None for a plain chessboard."""
-    if isinstance(plane, CirclePlane):
-        return Circles(*circle_places(plane), plane.asymmetric, (plane.cols, plane.rows))
-    if plane.markers is None:
-        return None
-    return Rectangles(*printed_rectangles(plane))
+def _chessboard(ends: tuple[float, float, float, float], first_black: bool) -> Rectangles:
+    """Squares between whole grid coordinates, and parts of squares at these ends along x and along y."""
+    x, y = (
+        np.array([low, *np.arange(np.floor(low) + 1, np.ceil(high)), high])
+        for low, high in (ends[:2], ends[2:])
+    )
+    even = (np.floor(x[:-1]) + np.floor(y[:-1])[:, None]) % 2 == 0
+    return Rectangles(x, y, np.pad(even == first_black, 1))
 
 
 def _nearest(lines: Array, place: Array) -> NDArray[np.intp]:
@@ -171,21 +172,24 @@ class Target:
     margin: float = 0.5  # squares of white paper beyond the pattern
 
     @cached_property
-    def printed(self) -> Rectangles | Circles | None:
-        """What is printed on the plane; None for a plain chessboard."""
-        return pattern_of(self.plane)
+    def printed(self) -> Rectangles | Circles:
+        """What is printed on the plane."""
+        plane = self.plane
+        if isinstance(plane, CirclePlane):
+            return Circles(*circle_places(plane), plane.asymmetric, (plane.cols, plane.rows))
+        if plane.markers is None:
+            return _chessboard(self.squares, self.first_black)
+        return Rectangles(*printed_rectangles(plane))
 
     @property
-    def pattern_box(self) -> tuple[float, float, float, float]:
-        """Ends of the pattern: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
-        if self.printed is not None:
-            return self.printed.box
+    def squares(self) -> tuple[float, float, float, float]:
+        """Ends of a plain chessboard: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
         return -1.0, float(self.plane.cols), -1.0, float(self.plane.rows)
 
     @property
     def paper_box(self) -> tuple[float, float, float, float]:
-        """Ends of the paper, like `pattern_box`."""
-        x_low, x_high, y_low, y_high = self.pattern_box
+        """Ends of the paper, like `squares`."""
+        x_low, x_high, y_low, y_high = self.printed.box
         return x_low - self.margin, x_high + self.margin, y_low - self.margin, y_high + self.margin
 
 
