@@ -11,7 +11,7 @@ from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES
-from neurocal_cli.errors import InputError, value_failures
+from neurocal_cli.errors import InputError
 from neurocal_cli.files.calibration_yaml import (
     calibration_from_field,
     camera_part,
@@ -28,31 +28,27 @@ from neurocal_cli.observations.points import Correspondences
 _UNKNOWN = "unknown"  # unit of lengths if no file states it
 
 
-def from_tree(root: Field, whole: bool) -> CameraSet:
-    """Read a calibration or a rig, with poses and points only if `whole`."""
+def _from_tree(root: Field) -> CameraSet:
+    """Read a calibration or a rig."""
     kind = own_kind(root)
-    if whole and kind in ("rig", "stereo"):
+    if kind in ("rig", "stereo"):
         return camera_set(rig_from_field(root) if kind == "rig" else stereo_from_field(root))
-    if not whole:
-        own = camera_part(root)
-        lens = Distortion(own["distortion_model"], own["distortion"])
-        camera = Camera(own["intrinsics"], lens, own["image_size"], own["camera_name"])
-        return CameraSet((camera,), program="neurocal")
     return camera_set(calibration_from_field(root))
 
 
-def without_points(root: Field, camera: CameraSet) -> Calibration:
-    """A calibration without its poses and points, from its file and the camera in it."""
-    block = neurocal_block(root)
-    own = camera_part(root)
+def without_points(root: Field) -> CameraSet:
+    """The camera of a calibration, which is its origin, with its covariance and without poses and points."""
+    block, own = neurocal_block(root), camera_part(root)
+    lens = Distortion(own["distortion_model"], own["distortion"])
+    camera = Camera(own["intrinsics"], lens, own["image_size"], own["camera_name"])
     names, covariance = own["covariance_names"], own["covariance"]
     if not names:
         names, covariance = own["given_names"], own["given_covariance"]
     undistorted = block["observations"].get("undistorted", "").text() if "observations" in block else ""
-    with value_failures(root.source):
-        points = Correspondences.none(camera.cameras[0].image_size, _UNKNOWN, undistorted)
-    calibration = replace(_calibration(camera, 0), points=points)
-    return replace(calibration, covariance=covariance, covariance_names=names)
+    points = Correspondences.none(camera.image_size, _UNKNOWN, undistorted)
+    found = CameraSet((camera,), program="neurocal")
+    known = {"points": points, "covariance": covariance, "covariance_names": names}
+    return replace(found, origin=replace(_calibration(found, 0), **known))
 
 
 def camera_set(result: Calibration | Rig) -> CameraSet:
@@ -151,7 +147,7 @@ FORMAT = Format(
     "neurocal",
     files="its own, YAML or JSON",
     told=_matches,
-    reader=lambda document: from_tree(document.root, whole=True),
+    reader=lambda document: _from_tree(document.root),
     texts=_text,
     written=tuple(MODELS),
     has_skew=True,

@@ -317,9 +317,7 @@ def read_given_camera(
     found = _read(document, whole=False)
     if len(found.cameras) > 1:
         raise FormatError("is a rig; give the file of one camera", document.source)
-    if found.program == "neurocal":
-        return neurocal.without_points(document.root, found)
-    return found.cameras[0]
+    return found.origin if isinstance(found.origin, Calibration) else found.cameras[0]
 
 
 def _read(document: Document, whole: bool = True) -> CameraSet:
@@ -332,7 +330,7 @@ def _read(document: Document, whole: bool = True) -> CameraSet:
             raise InputError(UNKNOWN)
         own = not whole and one is neurocal.FORMAT
         try:
-            found = neurocal.from_tree(document.root, whole) if own else one.read(document)
+            found = neurocal.without_points(document.root) if own else one.read(document)
         except NoCameraError as error:
             raise InputError(f"{error}{_nearest(document)}") from error
         for camera in found.cameras:
