@@ -20,6 +20,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import checked_size, real_array, real_rows
 from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.camera.resizing import Resizing
 from neurocal_cli.errors import InputError, UsageError
 
 
@@ -189,13 +190,11 @@ class Camera:
         factors = np.ones(2) * real_array("scale", scale)
         if factors.shape != (2,) or not (np.isfinite(factors) & (factors > 0)).all():
             raise InputError(f"the scale of an image must be positive, one or two numbers, found {scale}")
-        A = self.A.copy()
-        A[:2] *= factors[:, None]
-        A[:2, 2] += 0.5 * (factors - 1)
+        a, b = factors.tolist()
         size = self.image_size
         if size is not None:
-            size = max(1, round(size[0] * factors[0])), max(1, round(size[1] * factors[1]))
-        return replace(self, intrinsics=Intrinsics.from_matrix(A), image_size=size)
+            size = max(1, round(size[0] * a)), max(1, round(size[1] * b))
+        return replace(self, intrinsics=Resizing((a, b)).intrinsics(self.intrinsics), image_size=size)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of cropped images.
@@ -207,9 +206,8 @@ class Camera:
         width, height : int [px]
             Size of the cropped image.
         """
-        A = self.A.copy()
-        A[:2, 2] -= left, top
-        return replace(self, intrinsics=Intrinsics.from_matrix(A), image_size=(width, height))
+        intrinsics = Resizing(corner=(left, top)).intrinsics(self.intrinsics)
+        return replace(self, intrinsics=intrinsics, image_size=(width, height))
 
     def image_points(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Pixels u, v of normalised image points x, y."""

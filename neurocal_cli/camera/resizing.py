@@ -7,11 +7,8 @@ distortion acts on normalised points and does not change, and neither does the a
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError, UsageError
@@ -37,10 +34,6 @@ class Resizing:
     def mean(self) -> float:
         """Geometric mean of the scales in u and in v."""
         return float(np.sqrt(self.scale[0] * self.scale[1]))
-
-    def camera(self, camera: Camera) -> Camera:
-        """The camera of the new images."""
-        return replace(camera, intrinsics=self.intrinsics(camera.intrinsics), image_size=self.size)
 
     def intrinsics(self, old: Intrinsics) -> Intrinsics:
         """Intrinsic parameters of the new images; theta stays, because A11 and A12 have one scale."""

@@ -71,7 +71,10 @@ def resize(
     with value_failures(source_of(file)):
         changes = [change(camera.image_size) for camera in found.cameras]
     pairs = zip(changes, found.cameras, strict=True)
-    cameras = tuple(one.camera(camera) for one, camera in pairs)
+    cameras = tuple(
+        replace(camera, intrinsics=one.intrinsics(camera.intrinsics), image_size=one.size)
+        for one, camera in pairs
+    )
     origin = None if found.origin is None else resized(found.origin, changes)
     note(*write_result(result_of(replace(found, cameras=cameras, origin=origin)), output))
     warn(*_doubts(changes[0], found.cameras[0]))
