@@ -86,13 +86,13 @@ def calibrate(
     given, arguments = estimation.prepare(preparation.given_points(*points, board=board))
 
     from neurocal_cli.calibration.calibrate import calibrate as learn
-    from neurocal_cli.commands.show.camera_report import calibration_json, calibration_report
+    from neurocal_cli.commands.show.camera_report import calibration_json
     from neurocal_cli.files.result_files import write_result
 
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
     write = partial(write_result, lean=outputs.lean)
-    with outputs.concluding(calibration, calibration_json, calibration_report, write, inputs):
+    with outputs.concluding(calibration, calibration_json, write, inputs):
         verdict, distorted = calibration.verdict, not calibration.camera.distortion.is_identity
         if outputs.html is None:
             suggest(outputs.output, "neurocal report {} -o report.html")

@@ -134,7 +134,7 @@ def fit(
     """  # noqa: D301 - as in the group
     outputs.check(points)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
-    from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
+    from neurocal_cli.commands.show.zoom_report import lens_json
     from neurocal_cli.files.lens_files import read_lens_data, write_lens
 
     data = noted(read_lens_data, points)
@@ -145,7 +145,7 @@ def fit(
             learnt = fit_lens_cameras(data, same["seed"], topologies=topologies, progress=progress)
         else:
             learnt = fit_lens(data, skew=not no_skew, topologies=topologies, progress=progress, **same)
-    with outputs.concluding(learnt, lens_json, lens_report, write_lens):
+    with outputs.concluding(learnt, lens_json, write_lens):
         settings = " ".join(f"--{name} {name[0].upper()}" for name in learnt.controls)
         suggest(outputs.output, f"neurocal lens camera {{}} {settings} -o camera.yaml")
 
@@ -248,7 +248,7 @@ def evaluate(lens_file: str, points: str | None, plots: Plots, as_json: bool) ->
         if as_json:
             print_summary(show.lens_json(learnt))
         else:
-            print_text(lambda: show.lens_report(learnt))
+            print_text(learnt.summary)
         warn(*learnt.warnings)
         suggest(lens_file, "neurocal lens evaluate {} POINTS.csv", "neurocal report {} -o report.html")
         return

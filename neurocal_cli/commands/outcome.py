@@ -38,7 +38,6 @@ class Outputs:
         self,
         result: Any,
         in_json: Callable[[Any], dict[str, Any]],
-        in_words: Callable[[Any], str],
         write: Callable[[Any, str], tuple[str, ...] | None],
         inputs: Iterable[str | None] = (),
     ) -> Iterator[None]:
@@ -47,7 +46,7 @@ class Outputs:
         Further outputs are written inside. `write` returns what the file cannot represent. As JSON, the
         summary is printed after all. In the end, exit if the training did not converge.
         """
-        tell_summary(lambda: in_json(result), None if self.as_json else lambda: in_words(result))
+        tell_summary(lambda: in_json(result), None if self.as_json else result.summary)
         if not self.as_json:
             warn(*result.warnings)
         if not preparation.is_for_the_eye(self.output):

@@ -130,7 +130,7 @@ def rig(
     read = *inputs, board, *(file for _, file in known)
     outputs.check(read)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-    from neurocal_cli.commands.show.rig_report import rig_json, rig_report
+    from neurocal_cli.commands.show.rig_report import rig_json
     from neurocal_cli.files.result_files import write_result
     from neurocal_cli.files.rig_points import read_rig_points
 
@@ -151,7 +151,7 @@ def rig(
     with ProgressBar() as progress:
         found = calibrate_rig(points, camera_options, outliers=estimation.outliers, progress=progress)
     write = partial(write_result, lean=outputs.lean)
-    with outputs.concluding(found, rig_json, rig_report, write, inputs):
+    with outputs.concluding(found, rig_json, write, inputs):
         suggest(outputs.output, "neurocal evaluate {}", "neurocal triangulate {} POINTS.csv -o XYZ.csv")
 
 
@@ -250,7 +250,7 @@ def stereo(
     inputs = left, right, left_intrinsics, right_intrinsics
     outputs.check((*inputs, board), *ros_files)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
-    from neurocal_cli.commands.show.rig_report import stereo_json, stereo_report, views_alone
+    from neurocal_cli.commands.show.rig_report import stereo_json, views_alone
     from neurocal_cli.files.result_files import write_result
 
     prepared = [
@@ -262,7 +262,7 @@ def stereo(
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     note(*views_alone(rig.alone))
     write = partial(write_result, lean=outputs.lean, alpha=alpha)
-    with outputs.concluding(rig, stereo_json, stereo_report, write, inputs):
+    with outputs.concluding(rig, stereo_json, write, inputs):
         if ros is not None:
             from neurocal_cli.files.rig_yaml import format_ros_pair
 
