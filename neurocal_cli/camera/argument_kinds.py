@@ -116,7 +116,8 @@ def _kinds(annotated: Any, names: Mapping[str, Any]) -> dict[str, Any]:
 def _taken(name: str, value: Any, kinds: Mapping[str, Any]) -> Any:
     """An argument as its function takes it."""
     kind = kinds.get(name, Any)
-    one_of = [one for one in _alternatives(kind) if one is not NoneType]
+    alternatives = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    one_of = [one for one in map(_plain, alternatives) if one is not NoneType]
     if not _fits(value, kind):
         option = any(one in (bool, int) or get_origin(one) is Literal for one in one_of)
         shown = repr(value) if isinstance(value, (str, float)) else _shown(value)
@@ -141,10 +142,6 @@ def _with_choices_joined(kinds: list[Any]) -> list[Any]:
     words = [word for one in kinds if get_origin(one) is Literal for word in get_args(one)]
     others = [one for one in kinds if get_origin(one) is not Literal]
     return [*others, Literal[tuple(words)]] if words else others
-
-
-def _alternatives(kind: Any) -> tuple[Any, ...]:
-    return tuple(map(_plain, get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)))
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -131,10 +131,12 @@ _BOARD_FILE = (
 )
 
 
-def board_of_corners(command: F) -> F:
-    """Add ``--board``, for points of other programs without their places, a command's keyword ``board``."""
-    what = f"Board of corners whose file does not have their places, such as mrcal's. {_BOARD_FILE}"
-    return options.path("--board", "BOARD.yaml", what)(command)
+board_of_corners = options.path(
+    "--board",
+    "BOARD.yaml",
+    f"Board of corners whose file does not have their places, such as mrcal's. {_BOARD_FILE}",
+)
+"""For points of other programs without their places, a command's keyword ``board``."""
 
 
 def named_board(name: str, unit: str = "mm") -> Board:

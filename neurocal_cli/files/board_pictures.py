@@ -70,7 +70,9 @@ def board_pdf(sheet: Sheet) -> bytes:
         content.append(f"{place(square[0])} m {' '.join(f'{place(p)} l' for p in square[1:])} h")
     content += ["f"] if len(sheet.squares) else []
     for x, y, radius in sheet.discs:
-        content.append(_round([place(p) for p in (np.array([x, y]) + radius * _CIRCLE)]))
+        first, *others = [place(p) for p in np.array([x, y]) + radius * _CIRCLE]
+        curves = [" ".join(others[k : k + 3]) + " c" for k in range(0, len(others), 3)]
+        content.append(" ".join([f"{first} m", *curves, "h f"]))
     for line in sheet.lines:
         dash = f"[{_DASH * _POINT:.4f}] 0 d" if line.dashed else "[] 0 d"
         content.append(f"{dash} {line.width * _POINT:.4f} w {place(line.start)} m {place(line.end)} l S")
@@ -94,13 +96,6 @@ def board_pdf(sheet: Sheet) -> bytes:
             b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
         ]
     )
-
-
-def _round(points: list[str]) -> str:
-    """Path of a disc through the points of `_CIRCLE`."""
-    first, *others = points
-    curves = [" ".join(others[k : k + 3]) + " c" for k in range(0, len(others), 3)]
-    return " ".join([f"{first} m", *curves, "h f"])
 
 
 def _pdf(objects: list[bytes]) -> bytes:

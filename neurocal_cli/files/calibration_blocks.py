@@ -76,11 +76,6 @@ _BENDS = Columns("names=view: label, coefficients=bowl saddle twist: number")
 VERDICT = record(Verdict, Keys("word: text, reasons: sentences, advice: sentences, measures: measures"))
 
 
-def have_same_std(views: Mapping[str, ViewResult]) -> bool:
-    """Whether all views have standard deviations of the same parameters, so that they fit into columns."""
-    return len({frozenset(view.std) for view in views.values()}) <= 1
-
-
 def view_lines(key: str, pair: tuple[Mapping[str, ViewResult], Array], long: bool) -> Iterator[str]:
     """Lines of a block of views, from these and the camera matrix."""
     views, K = pair

@@ -27,7 +27,6 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import value_failures
 from neurocal_cli.files.calibration_blocks import (
     VERDICT,
-    have_same_std,
     observation_lines,
     read_observations,
     read_rejected,
@@ -161,7 +160,9 @@ def calibration_lines(
 ) -> Iterator[str]:
     """Lines of a file without header; see `camera_info_lines` and, for `by_rows`, `format_calibration`."""
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
-    long = large and not by_rows and have_same_std(cal.views)
+    # Columns hold the standard deviations of the same parameters in all views.
+    alike = len({frozenset(view.std) for view in cal.views.values()}) <= 1
+    long = large and not by_rows and alike
     yield from camera_info_lines(cal.camera, rectified)
     yield from block("neurocal", _BLOCK.lines(cal, long))
 

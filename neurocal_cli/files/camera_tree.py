@@ -204,7 +204,8 @@ def matrix_data(field: Field, length: int) -> Array:
         return matrix_data(field["data"], length)
     if isinstance(field.value, dict):
         numbers = field["data"]
-        if _is_packed(numbers.value):
+        first = numbers.value[0] if isinstance(numbers.value, list) and numbers.value else numbers.value
+        if isinstance(first, str) and first.startswith((_PACKED, "MW")):  # MW begins the head "1d"
             numbers = Field(_unpacked(numbers), field.source, numbers.path)
         data = matrix_data(numbers, -1)
         rows, cols = field["rows"].integer(), field["cols"].integer()
@@ -230,12 +231,6 @@ def matrix_data(field: Field, length: int) -> Array:
     if length >= 0 and len(data) != length:
         field.fail(f"{length} numbers")
     return data
-
-
-def _is_packed(data: Any) -> bool:
-    """Whether OpenCV's FileStorage wrote the data of a matrix as base64."""
-    text = data[0] if isinstance(data, list) and data else data
-    return isinstance(text, str) and text.startswith((_PACKED, "MW"))  # MW begins the head "1d"
 
 
 def _unpacked(field: Field) -> list[float]:

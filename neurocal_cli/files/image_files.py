@@ -31,17 +31,17 @@ _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 
 # Other kinds of files, by their first bytes.
-_VIDEO = "video"
+VIDEO = "video"
 _PHONES = ("HEIC", "AVIF")  # kinds that phones save
 _OTHERS = (
     (rb".{4}ftyp(heic|heix|hevc|mif1|msf1)", "HEIC"),
     (rb".{4}ftypavi[fs]", "AVIF"),
-    (rb".{4}(ftyp|moov|mdat|free|wide)", _VIDEO),
-    (rb"RIFF.{4}AVI ", _VIDEO),
+    (rb".{4}(ftyp|moov|mdat|free|wide)", VIDEO),
+    (rb"RIFF.{4}AVI ", VIDEO),
     (rb"RIFF.{4}WEBP", "WebP"),
-    (rb"\x1aE\xdf\xa3", _VIDEO),  # Matroska, WebM
-    (rb"\x00\x00\x01[\xb0-\xbf]", _VIDEO),  # MPEG
-    (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", _VIDEO),  # Windows Media
+    (rb"\x1aE\xdf\xa3", VIDEO),  # Matroska, WebM
+    (rb"\x00\x00\x01[\xb0-\xbf]", VIDEO),  # MPEG
+    (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", VIDEO),  # Windows Media
     (rb"GIF8[79]a", "GIF"),
 )
 
@@ -148,8 +148,8 @@ def read_header(data: bytes, source: str) -> Header:
         raise FormatError("is empty; give an image", source)
     reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
     if reader is None:
-        other = _other(data)
-        if other == _VIDEO:
+        other = other_kind(data)
+        if other == VIDEO:
             raise FormatError(
                 "is a video, but images are wanted; extract some, as with "
                 "`ffmpeg -i VIDEO -vf fps=1 frame%03d.png`",
@@ -171,12 +171,7 @@ def read_header(data: bytes, source: str) -> Header:
     return header
 
 
-def is_video_header(head: bytes) -> bool:
-    """Whether a file that begins with these bytes is a video."""
-    return _other(head) == _VIDEO
-
-
-def _other(data: bytes) -> str | None:
+def other_kind(data: bytes) -> str | None:
     """Kind of a file that is not a supported image; None if unknown."""
     return next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, one_line, reading_failures
-from neurocal_cli.files.image_files import Header, is_video_header, read_header
+from neurocal_cli.files.image_files import VIDEO, Header, other_kind, read_header
 from neurocal_cli.files.reading import read_bytes
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -222,7 +222,7 @@ def is_video(path: str) -> bool:
     if path == "-" or not os.path.isfile(path):
         return False
     with reading_failures(one_line(path)), open(path, "rb") as file:
-        return is_video_header(file.read(_HEAD))
+        return other_kind(file.read(_HEAD)) == VIDEO
 
 
 def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:

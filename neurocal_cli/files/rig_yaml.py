@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.rectification import Rectification, must_rectify, rectify
+from neurocal_cli.calibration.rig.rectification import must_rectify, rectify
 from neurocal_cli.calibration.rig.rig import Rig, StereoRig, of_two
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
@@ -72,7 +72,10 @@ def stereo_lines(rig: StereoRig, alpha: float | None, by_rows: bool) -> Iterator
         pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
     cameras = zip(("left", "right"), (rig.left, rig.right), pairs, strict=True)
     parts = [block(name, calibration_lines(camera, pair, by_rows)) for name, camera, pair in cameras]
-    yield from chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
+    own = [f"format: {STEREO_FORMAT}", *_POSE.lines(rig)]
+    if rectified is not None:
+        own += block("rectification", _RECTIFICATION.lines(rectified))
+    yield from chain(*parts, block("stereo", [*own, *_REST.lines(rig)]))
 
 
 def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, str]:
@@ -87,14 +90,6 @@ def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, st
     sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
     first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
     return first, second
-
-
-def _stereo_lines(rig: StereoRig, rectified: Rectification | None) -> Iterator[str]:
-    yield f"format: {STEREO_FORMAT}"
-    yield from _POSE.lines(rig)
-    if rectified is not None:
-        yield from block("rectification", _RECTIFICATION.lines(rectified))
-    yield from _REST.lines(rig)
 
 
 def _estimates(rig: StereoRig) -> list[tuple[str, tuple[float, float]]]:

@@ -29,24 +29,18 @@ def write_sample_data(folder: str) -> list[str]:
     NeurocalError
         A file of such a name is there with other content, or the sample data is not installed.
     """
-    data = _sample_data()
+    source = next((one for one in _sources() if (one / "README.md").is_file()), None)
+    if source is None:
+        raise NeurocalError("the sample data is not installed; install neurocal again with pip")
+    files = sorted(file for file in source.iterdir() if file.suffix in _KINDS)
     make_folder(folder)
-    for name, content in data.items():
-        path = os.path.join(folder, name)
+    for file in files:
+        path, content = os.path.join(folder, file.name), read_bytes(file)[0]
         if not os.path.exists(path):
             write_whole(path, content)
         elif os.path.isdir(path) or read_bytes(path)[0] != content:
             raise NeurocalError(f"{one_line(path)}: is no file of the sample data; give another folder")
-    return list(data)
-
-
-def _sample_data() -> dict[str, bytes]:
-    """Contents of all files by name."""
-    for source in _sources():
-        if (source / "README.md").is_file():
-            paths = sorted(path for path in source.iterdir() if path.suffix in _KINDS)
-            return {path.name: read_bytes(path)[0] for path in paths}
-    raise NeurocalError("the sample data is not installed; install neurocal again with pip")
+    return [file.name for file in files]
 
 
 def _sources() -> Iterator[Path]:

@@ -144,12 +144,6 @@ def verdict_block(verdict: Verdict | None) -> str:
     return f'<div class="verdict {word}"><b>{word}</b> <span>{escape(facts(verdict))}</span>{lists}</div>'
 
 
-def definitions(entries: Mapping[str, str]) -> str:
-    """Make a list of names and descriptions."""
-    lines = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in entries.items())
-    return f"<dl>{lines}</dl>"
-
-
 @frozen_dataclass
 class Origin:
     """The run that produced a result, as far as known."""
@@ -249,7 +243,9 @@ def error_bars(names: Sequence[str], errors: Sequence[float], overall: float) ->
     if not count or not max(errors, default=0) > 0:
         return ""
     width, height, left = 640.0, 240.0, 60.0
-    step = _round_step(max(*errors, overall) / 4)
+    least = max(*errors, overall) / 4
+    power = 10.0 ** np.floor(np.log10(least))
+    step = float(power * min(one for one in (1.0, 2.0, 5.0, 10.0) if one >= least / power))
     most = step * np.ceil(1.02 * max(*errors, overall) / step)
     each = (width - left) / count
 
@@ -301,12 +297,6 @@ def board_shape(across: Array, height: Array) -> str:
         f'<svg viewBox="{x:.4g} {y:.4g} {w:.4g} {h:.4g}" role="img" aria-label="shape of the board">'
         f'<rect x="{x:.4g}" y="{y:.4g}" width="{w:.4g}" height="{h:.4g}" class="frame"/>{discs}</svg>'
     )
-
-
-def _round_step(least: float) -> float:
-    """Round up to one of 1, 2, 5, 10, ..."""
-    power = 10.0 ** np.floor(np.log10(least))
-    return float(power * min(step for step in (1.0, 2.0, 5.0, 10.0) if step >= least / power))
 
 
 def heat_map(values: Array, size: tuple[float, float], dots: Array, unit: str, label: str) -> str:

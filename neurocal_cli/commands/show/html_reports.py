@@ -19,7 +19,6 @@ from neurocal_cli.commands.show.camera_report import parameter_rows, plane_repor
 from neurocal_cli.commands.show.html_page import (
     Origin,
     board_shape,
-    definitions,
     enlargement,
     error_bars,
     figure,
@@ -382,4 +381,5 @@ def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
     if origin.versions:
         entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())
     entries |= {f"SHA-256 of {one_line(name)}": digest for name, digest in origin.files.items()}
-    return definitions(entries)
+    lines = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in entries.items())
+    return f"<dl>{lines}</dl>"

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -31,11 +30,6 @@ class AdaptedCameras:
     losses: tuple[str, ...] = ()  # changes of the cameras and the shifts of pixels, for warnings
     remarks: tuple[str, ...] = ()  # data that are not in the file, for notes
     moved: tuple[Distance | None, ...] = ()  # shifts of the pixels of each camera
-
-
-def _parts(origin: Calibration | Rig) -> list[Calibration]:
-    """The calibrations in the contents of a neurocal file."""
-    return [origin] if isinstance(origin, Calibration) else list(origin.cameras.values())
 
 
 def adapt_cameras(
@@ -68,7 +62,8 @@ def adapt_cameras(
     # Pixels of the points with which each camera was calibrated.
     seen: list[Array | None] = [None] * len(cameras.cameras)
     if origin is not None:
-        seen = [part.points.pixels for part in _parts(origin)]
+        parts = [origin] if isinstance(origin, Calibration) else origin.cameras.values()
+        seen = [part.points.pixels for part in parts]
     for camera, points in zip(cameras.cameras, seen, strict=True):
         new, near, loss = _adapted(camera, target, model, force, points)
         squared, moves = _squared(new) if target.square else (new, 0.0)

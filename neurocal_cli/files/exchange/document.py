@@ -188,7 +188,12 @@ class Document:
     def array(self) -> np.ndarray[Any, Any] | None:
         """The array of an ``.npy`` file, or of a text of a few numbers; None for other files."""
         if self.data.startswith(b"\x93NUMPY"):
-            found = array_of(self.data, self.source)
+            try:
+                found = np.asarray(np.load(io.BytesIO(self.data), allow_pickle=False))
+            except _DAMAGED as error:
+                raise FormatError(
+                    "is no .npy file of numbers; save it again with numpy.save", self.source
+                ) from error
         else:
             rows = few_numbers(self.text)
             if rows is None:
@@ -279,14 +284,6 @@ def _named(tree: dict[str, Any]) -> dict[str, Any]:
     if len(matrices) != 1 or len(rows) > 1:
         return tree
     return {"K": tree[matrices[0]], **({"D": rows[0]} if rows else {})}
-
-
-def array_of(data: bytes, source: str) -> np.ndarray[Any, Any]:
-    """Read the array of an ``.npy`` file."""
-    try:
-        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
-    except _DAMAGED as error:
-        raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
 
 
 def sections(text: str, source: str) -> dict[str, Any]:

@@ -218,10 +218,6 @@ class PoseKeys:
             put(tree, self.keys, np.concatenate([rotation, pose.t]))
 
 
-def _whole_file(document: Document) -> Parts:
-    return {"camera": document.root}
-
-
 @frozen_dataclass(eq=False)
 class Format(CameraKeys):
     """A format that is read, and perhaps written, by its tables.
@@ -232,7 +228,7 @@ class Format(CameraKeys):
     files: str = ""  # its files, for the documentation
     told: str | Callable[[Document], object] = ""  # keys at the top of a file, or what tells it
     # What finds the trees of the cameras, or the path of a list of them.
-    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = _whole_file
+    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = lambda document: {"camera": document.root}
     pose: PoseKeys | Callable[[Parts], Sequence[Pose | None]] | None = None  # keys of it, or what finds all
     unit: str | Callable[[Field], str | None] | None = None  # of lengths, or what finds it in the first tree
     views: Callable[[Field], Mapping[str, Pose]] | None = None  # what finds those of views in the first tree

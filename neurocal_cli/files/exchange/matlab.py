@@ -136,20 +136,16 @@ _VIEW = re.compile(r"(?:omc|Tc)_(\d+)").fullmatch
 _RIGHT = PoseKeys("om T", from_first=True)
 
 
-def _bouguet_root(document: Document) -> Field:
-    if not _SCRIPT(document.text):
-        return document.root
-    variables = {name: np.array(value) for name, value in (stated(document.text) or {}).items()}
-    return Field(lists(variables), document.source)
-
-
 def _sides(root: Field) -> list[str]:
     return [side for side in ("", "_left", "_right") if f"fc{side}" in root]
 
 
 def _bouguet_parts(document: Document) -> dict[str, Field]:
     """The part of each camera, whose skew is that of its matrix."""
-    root = _bouguet_root(document)
+    root = document.root
+    if _SCRIPT(document.text):
+        variables = {name: np.array(value) for name, value in (stated(document.text) or {}).items()}
+        root = Field(lists(variables), document.source)
     parts = {}
     for side in _sides(root):
         part = {key: root[f"{key}{side}"].value for key in ("fc", "cc", "kc")}
