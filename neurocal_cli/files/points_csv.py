@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError, value_failures
 from neurocal_cli.files.table import Table, read_table
-from neurocal_cli.files.table_header import Schema, quoted_field
+from neurocal_cli.files.table_header import METADATA, Schema, quoted_field
 from neurocal_cli.files.writing import write_whole
 from neurocal_cli.observations.labels import most_moved
 from neurocal_cli.observations.points import Correspondences
@@ -128,21 +128,10 @@ def format_points(points: Correspondences) -> str:
     names, blocks = value_columns(points)
     numbers = json.dumps(np.hstack([points.world, *blocks]).tolist(), separators=(",", ":"))
     rows = map(",".join, zip(*labels.values(), numbers[2:-2].split("],["), strict=True))
-    lines = []
-    if points.image_size is not None:
-        lines.append(f"# image_size: {points.image_size[0]} {points.image_size[1]}")
-    if points.image_center is not None:
-        lines.append(f"# image_center: {points.image_center[0]!r} {points.image_center[1]!r}")
     if points.unit != points.unit.strip(" \t,;") or re.search(r"[\r\n\0]", points.unit) or not points.unit:
         raise InputError(f"the unit {points.unit!r} cannot be written; name it in a word, such as mm")
-    if points.distances:
-        measured = [[one.start, one.end, one.length, one.std] for one in points.distances]
-        lines.append(f"# distances: {json.dumps(measured)}")
-    if points.board:
-        lines.append(f"# board: {points.board}")
-    lines.append(f"# unit: {points.unit}")
-    if points.undistorted:
-        lines.append(f"# undistorted: {points.undistorted}")
+    given = {key: value for key in METADATA if (value := getattr(points, key))}
+    lines = [f"# {key}: {METADATA[key][1](value)}" for key, value in given.items()]
     return "\n".join([*lines, ",".join([*labels, *PLACE, *names]), *rows, ""])
 
 

@@ -69,11 +69,11 @@ class Metadata:
         match = _METADATA.fullmatch(line.strip(" \t"))
         if match is None:
             if key := _meant(line):
-                hint = f"{line[:40]!r} is not used; for {key}, write {_VALUES[key][1]}"
+                hint = f"{line[:40]!r} is not used; for {key}, write {METADATA[key][2]}"
                 self.misspelt.append(f"{number}: {hint}")
             return
         key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
-        read, hint = _VALUES.get(key, (lambda text: text, "the text of a board file on one line"))
+        read, _, hint = METADATA[key]
         value = read(text)
         if value is None:
             raise InputError(f"{key} is {text[:40]!r}; write {hint}")
@@ -90,7 +90,7 @@ def _meant(line: str) -> str | None:
     from difflib import get_close_matches
 
     word = re.sub("[ -]", "_", match[1].lower())
-    return next(iter(get_close_matches(word, _VALUES, 1, _ALIKE)), None)
+    return next(iter(get_close_matches(word, METADATA.keys() - {"board"}, 1, _ALIKE)), None)
 
 
 def _size(text: str) -> tuple[int, int] | None:
@@ -106,6 +106,10 @@ def _centre(text: str) -> tuple[float, float] | None:
     return float(words[0]), float(words[1])
 
 
+def _numbers(pair: tuple[float, float]) -> str:
+    return " ".join(map(str, pair))
+
+
 def _distances(text: str) -> tuple[Distance, ...] | None:
     try:
         return tuple(Distance(*row) for row in json.loads(text))
@@ -113,12 +117,18 @@ def _distances(text: str) -> tuple[Distance, ...] | None:
         return None
 
 
-_VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
-    "image_size": (_size, "two whole numbers as in `# image_size: 640 480`"),
-    "image_center": (_centre, "two numbers as in `# image_center: 320 240`"),
-    "distances": (_distances, 'a list as in `# distances: [["0:0", "8:5", 212.3, 0.05]]`'),
-    "undistorted": (lambda text: text if text in UNDISTORTED else None, f"one of {', '.join(UNDISTORTED)}"),
-    "unit": (lambda text: text or None, "a name as in `# unit: mm`"),
+# Keys in the order in which they are written: how a value is read and written, and what to write.
+METADATA: dict[str, tuple[Callable[[str], Any], Callable[[Any], str], str]] = {
+    "image_size": (_size, _numbers, "two whole numbers as in `# image_size: 640 480`"),
+    "image_center": (_centre, _numbers, "two numbers as in `# image_center: 320 240`"),
+    "distances": (
+        _distances,
+        lambda found: json.dumps([[one.start, one.end, one.length, one.std] for one in found]),
+        'a list as in `# distances: [["0:0", "8:5", 212.3, 0.05]]`',
+    ),
+    "board": (str, str, "the text of a board file on one line"),
+    "unit": (lambda text: text or None, str, "a name as in `# unit: mm`"),
+    "undistorted": ({one: one for one in UNDISTORTED}.get, str, f"one of {', '.join(UNDISTORTED)}"),
 }
 
 
