@@ -140,10 +140,7 @@ def triangulate(
     for side, camera in (("left", rig.left), ("right", rig.right)):
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
-    from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
-
-    sigma = _sigma_of(rig) if sigma is None else sigma
-    limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
+    sigma, limit = _accuracy(rig, sigma, epipolar_limit)
     tally = _Tally(rig, sigma, limit)
     matches = _begun(inputs[-1], MATCHES)
     end_waiting()
@@ -153,12 +150,15 @@ def triangulate(
     tally.tell(as_json)
 
 
-def _sigma_of(rig: Rig) -> float:
-    """The noise of a rig's own points, or what is usual if it does not state any."""
-    if not math.isnan(rig.sigma):
-        return rig.sigma
-    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-    return _USUAL_SIGMA
+def _accuracy(rig: Rig, sigma: float | None, limit: float | None) -> tuple[float, float]:
+    """The noise of pixels, else that of the rig's own points or what is usual, and the limit of errors."""
+    from neurocal_cli.calibration.rig.triangulation import epipolar_limit
+
+    if sigma is None and math.isnan(rig.sigma):
+        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+    usual = _USUAL_SIGMA if math.isnan(rig.sigma) else rig.sigma
+    sigma = usual if sigma is None else sigma
+    return sigma, epipolar_limit(sigma) if limit is None else limit
 
 
 def _begun(file: str, schema: Schema) -> Iterator[Batch]:
@@ -221,15 +221,13 @@ def _triangulate_many(
 ) -> None:
     """Triangulate points from any number of cameras."""
     from neurocal_cli.calibration.rig.many_views import triangulate_many
-    from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
     from neurocal_cli.files.measurement_csv import format_many_points, read_sightings
     from neurocal_cli.files.rig_yaml import read_rig
 
     rig = read_rig(file)
     preparation.warn_of_poor("rig", rig, "; points in space may be far off")
     seen = noted(read_sightings, matches)
-    sigma = _sigma_of(rig) if sigma is None else sigma
-    limit = usual_limit(sigma) if limit is None else limit
+    sigma, limit = _accuracy(rig, sigma, limit)
     found = triangulate_many(rig, seen.point, seen.camera, seen.pixels, limit=limit)
     names = list(rig.cameras)
     text = format_many_points(found, seen.names, names, unit=rig.unit, sigma=sigma, limit=limit)
