@@ -47,15 +47,7 @@ class DataSet:
 
 
 def read_data_sets(path: str) -> list[DataSet]:
-    """Read a manifest, or find the data sets in the leaf folders of a tree.
-
-    Raises
-    ------
-    FormatError
-        The manifest cannot be read, has no column `name`, or a name twice or that is no name of a folder.
-    InputError
-        The tree has no folder with images or points, or two with the same name.
-    """
+    """Read a manifest, or find the data sets in the leaf folders of a tree; each has a name of its own."""
     found = _in_tree(path) if os.path.isdir(path) else _in_manifest(path)
     seen: dict[str, DataSet] = {}
     for one in found:

@@ -22,12 +22,7 @@ _INSTALLED = "share/neurocal/sample_data/README.md"  # in pyproject.toml
 def write_sample_data(folder: str) -> list[str]:
     """Write the sample data into a folder, which is made if it does not exist; return the names of all files.
 
-    Files that are there already are left as they are.
-
-    Raises
-    ------
-    NeurocalError
-        A file of such a name is there with other content, or the sample data is not installed.
+    Files that are there already are left as they are; one with other content is a NeurocalError.
     """
     source = next((one for one in _sources() if (one / "README.md").is_file()), None)
     if source is None:

@@ -106,13 +106,7 @@ def _view_json(view: Candidate) -> dict[str, Any]:
 
 
 def draw_advice(advice: Advice, calibration: Calibration, kind: str = "png") -> bytes:
-    """Draw each view that is advised for a camera (png, pdf or svg).
-
-    Raises
-    ------
-    NeurocalError
-        matplotlib is not installed.
-    """
+    """Draw each view that is advised for a camera (png, pdf or svg)."""
     views = [(view, f"then {after:.3g} px") for view, after in zip(advice.views, advice.after, strict=True)]
     title = f"Views to take next; now {advice.before:.3g} px. The thick side is near."
     return draw_views(calibration, views, title, kind)

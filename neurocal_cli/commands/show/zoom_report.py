@@ -170,11 +170,6 @@ def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
     """Draw each parameter over the settings, with data, prediction and a band of two standard deviations.
 
     The picture (png, pdf or svg) is the same for the same lens, byte for byte.
-
-    Raises
-    ------
-    NeurocalError
-        matplotlib is not installed.
     """
     with _drawing(len(lens.names) + (not lens.known), kind) as (figure, panels, file):
         for j, name in enumerate(lens.names):

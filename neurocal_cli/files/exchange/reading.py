@@ -252,22 +252,7 @@ def read_cameras(
 
     Two are the left and the right camera of ROS, mrcal or EuRoC, the two files of OpenCV's stereo sample, or
     a ``.npy`` of the matrix and one of the coefficients.
-
-    Parameters
-    ----------
-    paths : sequence of paths
-        One or two; a folder is a model of COLMAP, ``-`` is standard input.
-    notes, warnings : list of str, optional
-        Remarks about what was read, and doubts about it, are appended.
-    distortion : str, optional
-        The distortion model, one of `MODELS`, where a file has coefficients and does not say of which model.
-    size : (width, height), optional
-        Of the images, where a file has cameras of several.
-
-    Raises
-    ------
-    FormatError
-        No known format, or one that contradicts itself or does not tell enough; the message says what to do.
+    A folder is a model of COLMAP. For the other arguments see `Document`.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
