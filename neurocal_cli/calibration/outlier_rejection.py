@@ -14,6 +14,7 @@ Few points fit better without some of them whether these are wrong or not, up to
 equations are left, the evidence decides. For s spare equations with the squared error c, its logarithm is
 log Gamma(s / 2) - s / 2 log(pi c), with the noise level integrated out (Jeffreys' prior). Each of k outliers
 is anywhere in the image, of area F, and any k of n points may be those: - k log F - log(n over k).
+It is asked with the lens of all points first; the lens is selected again only where that favours outliers.
 
 A large error that agrees with normal noise begins the search as well, because it may hide outliers. They are
 left out only if the error falls to less than half without them, which trimming noise does not reach.
@@ -22,6 +23,7 @@ left out only if the error falls to less than half without them, which trimming 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from math import comb, lgamma, log, pi
 
@@ -106,6 +108,12 @@ def fit_robustly(
     rough = errors.rms > _ROUGH * pixel_spread(problem.points)
     if not (contradicts or rough):
         return first, Rejected()
+    if options.distortion == "auto" and _has_few_spare_equations(first):
+        with suppress(DegenerateGeometryError):
+            same_lens = replace(options, distortion=first.state.model)
+            found = _agreeing(first.problem, same_lens, first, None)
+            if not _is_more_probable(*_searched(problem.points, same_lens, *found), first):
+                return first, Rejected()
     try:
         kept, solution = _searched(problem.points, options, *_agreeing(problem, options, first, None))
     except _NoConsensusError:  # the networks know less than the camera of all points

@@ -18,7 +18,7 @@ from neurocal_cli.adjustment.problem import Problem, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Rejected
-from neurocal_cli.calibration.lens_choice.candidate_models import as_fisheye
+from neurocal_cli.calibration.lens_choice.candidate_models import adjusted_to
 from neurocal_cli.calibration.lens_choice.given_model import WRONG_LENS
 from neurocal_cli.calibration.lens_choice.model_selection import predicts_decidedly_better
 from neurocal_cli.calibration.lens_choice.monotonic_fit import normal_part
@@ -77,7 +77,8 @@ def _rich_lens(solution: Solution) -> Solution | None:
     if held is None or (held.of_all_views and held.causes[0].rival.cause != RICHER_LENSES[0].cause):
         return None
     problem = problem.with_points(problem.points if target is None else target.as_given(problem.points))
-    fisheye, adjusted = as_fisheye(problem, normalised(solution.in_pixels, problem.views))
+    fisheye = problem.with_model("fisheye")
+    adjusted = adjusted_to(fisheye, normalised(solution.in_pixels, problem.views))
     start = replace(solution, problem=fisheye, adjusted=adjusted, target=None)
     try:
         others = _lost(solution, repeated)

@@ -102,10 +102,10 @@ def supported(problem: Problem, model: str) -> Problem | None:
     return with_model
 
 
-def as_fisheye(problem: Problem, state: CameraState) -> tuple[Problem, Adjusted]:
-    """Fit a fisheye with all its coefficients, starting from a state of any model."""
-    fisheye = problem.with_model("fisheye")
-    return fisheye, fisheye.adjust(_started(fisheye, state), _STEPS)
+def adjusted_to(problem: Problem, state: CameraState) -> Adjusted:
+    """Fit the problem's model, starting from a state of any model."""
+    steps = _RATIONAL_STEPS if problem.distortion.model == "rational" else _STEPS
+    return problem.adjust(_started(problem, state), steps)
 
 
 def fit_candidates(
@@ -280,10 +280,8 @@ class _Chain:
 
     def _fit(self, problem: Problem, state: CameraState) -> Candidate | None:
         """Fit one model; None if it did not converge, or if a part of the data is indispensable."""
-        model = problem.distortion.model
-        steps = _RATIONAL_STEPS if model == "rational" else _STEPS
-        adjusted = problem.adjust(_started(problem, state), steps)
-        if not adjusted.converged and model != "none":
+        adjusted = adjusted_to(problem, state)
+        if not adjusted.converged and adjusted.state.model != "none":
             return None
         return _assessed(problem, adjusted, self.by_views, self.reach)
 

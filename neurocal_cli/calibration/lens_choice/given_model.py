@@ -29,7 +29,7 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.observability import is_weak
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
-from neurocal_cli.adjustment.residual_correlation import independent_residuals
+from neurocal_cli.adjustment.residual_correlation import independent_residuals, point_residuals
 from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back
 from neurocal_cli.calibration.verdict.findings import log_odds
@@ -66,25 +66,32 @@ def with_more_starts(solution: Solution, more_starts: Starts | None) -> Solution
     poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
     if not poor and solution.alike < WRONG_LENS:
         return solution
-    if not may_lead_lower(solution, LOWER, lambda few: [total_cost(_lowest(few, more_starts))]):
+    if not may_lead_lower(solution, LOWER, more_starts):
         return solution
     return replace(solution, adjusted=_lowest(solution, more_starts))
 
 
-def may_lead_lower(solution: Solution, share: float, costs: Callable[[Solution], Iterable[float]]) -> bool:
+def may_lead_lower(solution: Solution, share: float, more_starts: Starts) -> bool:
     """Whether other starts may lead below a share of the squared error; of many views, a few are tried.
 
-    `costs` are the squared errors that they lead to.
+    The lens of the solution is fitted from each start, which is the minimum of a lens of its own.
     """
     few = of_few_views(solution, _FEW_VIEWS)
     if few is solution or is_elsewhere(few, solution):
         return True
-    return any(cost < share * total_cost(few.adjusted) for cost in costs(few))
+    # Imported here, because most calibrations need no other starts.
+    from neurocal_cli.calibration.lens_choice.candidate_models import adjusted_to
+
+    problem, least = few.problem, share * total_cost(few.adjusted)
+    return any(
+        (point_residuals(problem.views, start) ** 2).sum() < least
+        or total_cost(adjusted_to(problem, start)) < least
+        for start in more_starts(problem)
+    )
 
 
 def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
     """The lowest minimum of the wanted model from all starts."""
-    # Imported here, because most calibrations need no other starts.
     from neurocal_cli.calibration.lens_choice.candidate_models import fit_candidates
     from neurocal_cli.camera.nearest_camera import similar_states
 

@@ -16,7 +16,7 @@ enough. If none does, the next simpler one is tried as long as it hardly lowers 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
@@ -116,7 +116,11 @@ def _with_other_starts(
 ) -> dict[str, Candidate]:
     """Fit from other starts if the present fits may be local minima; the best of all fits of each model."""
     limit = _limit(fitted)
-    if limit == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
+    if limit == 0:
+        return fitted
+    closest = min(fitted.values(), key=lambda c: c.cost)
+    whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
+    if np.isfinite(limit) and not may_lead_lower(whole, limit / closest.cost, more_starts):
         return fitted
     for start in more_starts(solution.problem):
         others = fit_candidates(solution.problem, start, by_views)
@@ -126,20 +130,6 @@ def _with_other_starts(
         if (limit := _limit(fitted)) == 0:
             break
     return fitted
-
-
-def _may_lead_lower(
-    fitted: dict[str, Candidate], limit: float, solution: Solution, more_starts: Starts
-) -> bool:
-    """Whether another start leads below the limit; with many views, tested on a few of them."""
-    closest = min(fitted.values(), key=lambda c: c.cost)
-
-    def costs(few: Solution) -> Iterator[float]:
-        for start in more_starts(few.problem):
-            yield from (c.cost for c in fit_candidates(few.problem, start, by_views=False).values())
-
-    whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
-    return not np.isfinite(limit) or may_lead_lower(whole, limit / closest.cost, costs)
 
 
 def _limit(fitted: dict[str, Candidate]) -> float:
