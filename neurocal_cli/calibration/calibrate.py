@@ -17,7 +17,7 @@ from neurocal_cli.calibration.calibration import Calibration, Rejected, undistor
 from neurocal_cli.calibration.fit import fit, shows_skew
 from neurocal_cli.calibration.result import calibration_of, with_given_covariance
 from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
-from neurocal_cli.calibration.verdict.odd_points import repeated_views
+from neurocal_cli.calibration.verdict.odd_points import images_without_names, repeated_views
 from neurocal_cli.calibration.verdict.rules import assess
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.directions import WITH_XI
@@ -279,7 +279,8 @@ def _explained(error: DegenerateGeometryError, points: Correspondences, type: in
     from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
     from neurocal_cli.calibration.verdict.proportions import unlike_axes
 
-    true = mistake_in_all_views(points) or (unlike_axes(points) if type in (1, 2) else None)
+    true = images_without_names(points) or mistake_in_all_views(points)
+    true = true or (unlike_axes(points) if type in (1, 2) else None)
     text, copies = "; ".join(true or ()) or str(error), repeated_views(points)
     if copies:
         text += (

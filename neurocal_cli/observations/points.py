@@ -344,10 +344,11 @@ class Correspondences:
             return
         row, earlier = repeat
         where = f"in row {earlier + 1}" if self.lines is None else f"on line {self.lines[earlier]}"
-        view = "" if self.view is None else f" in the view {self.view_names[self.view_index[row]][:60]!r}"
+        name = "" if self.view is None else f" in the view {self.view_names[self.view_index[row]][:60]!r}"
+        images = ", or name the image of each row as its view" if self.view is None else ""
         raise InputError(
-            f"{self.place(row)}: the point {str(ids[row])[:60]!r} is already {where}{view}; remove one of "
-            "the rows"
+            f"{self.place(row)}: the point {str(ids[row])[:60]!r} is already {where}{name}; remove one of "
+            f"the rows{images}"
         )
 
     def _check_covariance(self, covariance: Array) -> None:

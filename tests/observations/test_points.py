@@ -64,7 +64,7 @@ def test_lists_are_taken_and_arrays_are_copied_and_read_only() -> None:
         ({"world": np.zeros((0, 3)), "pixels": np.zeros((0, 2))}, "no points"),
         ({"view": ["a"] * 5}, "view needs one entry for each of the 6 points"),
         ({"point": ["a"] * 7}, "point needs one entry"),
-        ({"point": list("abcdbe")}, "row 5: the point 'b' is already in row 2; remove one of the rows"),
+        ({"point": list("abcdbe")}, "row 5: the point 'b' is already in row 2; remove one of the rows, or"),
         (
             {"view": [1, 1, 2, 2, 1, 2], "point": [1, 2, 1, 2, 3, 2]},
             "row 6: the point '2' is already in row 4 in the view '2'",

@@ -318,6 +318,7 @@ FLAT: dict[str, Spoiler] = {
     "two images under one name": lambda p, rng: replace(
         p, view=np.where(np.asarray(p.view) == "view01", "view00", np.asarray(p.view)), point=None
     ),
+    "ten images without names": lambda p, rng: replace(p, view=None, point=None),
     "boards in a corner of the image only": lambda p, rng: seen(
         0.2 * board(), [Pose(q.R, np.array([-160.0, -110.0, 500.0])) for q in poses(10, 1)], CAMERA.A, 5
     ),
@@ -473,6 +474,7 @@ CAUSES: dict[str, str] = {
     "noise of 6 px": "noise",
     "pixels rounded to 8 px": "rounded to multiples of 8 px",
     "two images under one name": "two images under one name",
+    "ten images without names": "give each image a name of its own",
     "boards in a corner of the image only": "cover 3 % of the image",
     "two tilts of three degrees": "parallel",
     "strong distortion, called a pinhole": "distortion model",

@@ -26,6 +26,7 @@ from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.points import Correspondences
 
+_NAME_IMAGES = "give each image a name of its own as its view"
 _BESIDE = 1.0  # px by which a detected point may lie outside the image
 _NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 _SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
@@ -156,11 +157,19 @@ def points_given_twice(points: Correspondences) -> Iterator[Finding]:
     some = (n_twice > 0) & ~whole
     twice = "points are given twice with different pixels"
     for which, reason, advice in (
-        (whole, f"most {twice}, as of two images under one name", "give each image a name of its own"),
+        (whole, f"most {twice}, as of two images under one name", _NAME_IMAGES),
         (some, f"{int(n_twice[some].sum())} {twice}", "check the ids and X,Y,Z of these points"),
     ):
         if which.any():
             yield 1, f"{name_some(np.array(points.view_names)[which])}: {reason}", advice
+
+
+def images_without_names(points: Correspondences) -> tuple[str, str] | None:
+    """What rows without views show, and what to do, if they are those of several images."""
+    if points.view is not None or np.linalg.matrix_rank(points.world - points.world.mean(axis=0)) < 2:
+        return None  # points on one line or at one place have another fault
+    _, reason, advice = next(points_given_twice(points), (0, "", ""))
+    return (reason.split(": ")[-1], advice) if advice == _NAME_IMAGES else None
 
 
 def _own_points(points: Correspondences) -> NDArray[np.intp]:
