@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array, Shape
-from neurocal_cli.camera.undistortion import Undistorted, chosen_view, sources
+from neurocal_cli.camera.undistortion import Undistorted, sources, undistorted_view
 from neurocal_cli.errors import InputError
 
 Interpolation = Literal["nearest", "linear", "cubic", "lanczos"]
@@ -144,7 +144,8 @@ def undistort_image(
     """
     camera = camera_of(camera)
     size = camera.image_size or _size(image)
-    return Remapping(camera, chosen_view(camera, alpha, to, fov, size), size, interpolation)(image)
+    new = undistorted_view(camera, size, to, fov, alpha=alpha)
+    return Remapping(camera, new, size, interpolation)(image)
 
 
 def _size(image: NDArray[Any]) -> tuple[int, int]:

@@ -135,65 +135,35 @@ class Field(NamedTuple):
         )  # fmt: skip
 
 
-def chosen_view(
-    camera: Camera,
-    alpha: float | None,
-    to: str,
-    fov: float | None,
-    size: tuple[int, int] | None,
-    new_size: tuple[int, int] | None = None,
-) -> Undistorted:
-    """The camera of undistorted pixels, by alpha, or by shape, field of view and size.
-
-    Raises InputError for both of them, and if there is no image size where one is needed.
-    """
-    if to == "plane" and fov is None and new_size is None:
-        return undistorted_camera(camera, alpha, size)
-    if alpha is not None:
-        raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
-    size = _known("a field of view", size or camera.image_size)
-    return undistorted_view(camera, size, to, fov, new_size)
-
-
-def undistorted_camera(
-    camera: Camera, alpha: float | None = None, size: tuple[int, int] | None = None
-) -> Camera:
-    """The camera of undistorted pixels.
-
-    alpha is that of `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
-    The size of the images is needed for alpha, and is by default the camera's. Raises InputError if there is
-    none, or if the distortion leaves no picture.
-    """
-    size = size or camera.image_size
-    intrinsics = plane_like(camera)
-    if alpha is not None:
-        intrinsics = new_matrix(camera, _known("alpha", size), alpha)
-    return Camera(intrinsics, Distortion(), size, camera.name)
-
-
-def _known(what: str, size: tuple[int, int] | None) -> tuple[int, int]:
-    """The size of the images; an InputError if it is not known."""
-    if size is None:
-        raise InputError(
-            f"{what} needs the size of the images, which neither the camera nor the points have; add "
-            "image_size"
-        )
-    return size
-
-
 def undistorted_view(
     camera: Camera,
-    size: tuple[int, int],
+    size: tuple[int, int] | None = None,
     shape: str = "plane",
     fov: float | None = None,
     new_size: tuple[int, int] | None = None,
+    alpha: float | None = None,
 ) -> Undistorted:
     """Choose the projection of undistorted images, one of `UNDISTORTED`, for images of some size [px].
 
-    The field of view is from left to right [degrees]. By default a plane keeps the scale of the image centre;
-    the other shapes show the whole field of view. The undistorted images have the same size, unless a new one
-    is given. Raises InputError if the shape does not exist, or cannot show that field of view.
+    A plane keeps the camera's matrix, of a wide lens its scale in the middle, unless alpha of `new_matrix` or
+    the field of view from left to right [degrees] is given; by default the other shapes show the whole field
+    of view. The size of the images is by default the camera's; the undistorted ones have the same, unless a
+    new one is given. Raises InputError if the shape does not exist, or cannot show that field of view, if
+    alpha is not all that is given, and if the size is needed and not known.
     """
+    size = size or camera.image_size
+    own = shape == "plane" and fov is None and new_size in (None, size)
+    if alpha is not None and not own:
+        raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
+    if own and alpha is None:
+        return Camera(plane_like(camera), Distortion(), size, camera.name)
+    if size is None:
+        raise InputError(
+            f"{'a field of view' if alpha is None else 'alpha'} needs the size of the images, which neither "
+            "the camera nor the points have; add image_size"
+        )
+    if alpha is not None:
+        return Camera(new_matrix(camera, size, alpha), Distortion(), size, camera.name)
     if shape not in UNDISTORTED:
         raise InputError(f"the shape must be one of {', '.join(UNDISTORTED)}, not {shape[:40]!r}")
     most = _WIDEST_PLANE if shape == "plane" else 360.0
@@ -209,7 +179,7 @@ def undistorted_view(
     if shape == "plane":
         if fov is None:
             plain = Camera(plane_like(camera), Distortion(), size, camera.name)
-            return plain.rescaled((float(factors[0]), float(factors[1]))) if new_size != size else plain
+            return plain.rescaled((float(factors[0]), float(factors[1])))
         # atan(left / f) + atan(right / f) = fov: with the tangent of the sum, a quadratic equation.
         half = 0.5 * (left + right) / np.tan(np.radians(fov))
         f = float(half + np.sqrt(half * half + left * right))

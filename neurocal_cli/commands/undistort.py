@@ -130,7 +130,7 @@ def undistort(
         raise UsageError("-o has no effect without FILE; give FILE, or leave out -o")
     preparation.check_summary(as_json, new_camera, maps, output if files else None)
     from neurocal_cli.camera.camera import camera_of
-    from neurocal_cli.camera.undistortion import chosen_view
+    from neurocal_cli.camera.undistortion import undistorted_view
 
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):
@@ -142,7 +142,7 @@ def undistort(
         make_folder(folder)
     preparation.check_outputs((new_camera, maps, *outputs), (camera, *paths))
     original = camera_of(preparation.known_camera(camera))
-    view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
+    view = partial(undistorted_view, original, shape=shape, fov=fov, new_size=size, alpha=alpha)
     work = _Undistorting(original, view, interpolation, original.image_size)
     places = list(zip(paths, outputs, strict=True))
     reasons = each_of(places, work.correct, "files", "undistorted") if places else {}

@@ -13,9 +13,9 @@ from neurocal_cli.camera.geometry import Array, Shape
 from neurocal_cli.camera.given_values import real_rows
 from neurocal_cli.camera.undistortion import (
     Undistorted,
-    chosen_view,
     distorted_by_undistorted,
     undistort_pixels,
+    undistorted_view,
 )
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.measured_directions import unit
@@ -81,7 +81,7 @@ def undistort_points(
         flat = pixels.reshape(-1, 2)
         rows = Correspondences(np.zeros((len(flat), 3)), flat, image_size=camera.image_size, source="pixels")
         return undistort_points(rows, camera, alpha, to, fov).pixels.reshape(pixels.shape)
-    return map_points(points, camera, chosen_view(camera, alpha, to, fov, points.image_size))
+    return map_points(points, camera, undistorted_view(camera, points.image_size, to, fov, alpha=alpha))
 
 
 def shown(

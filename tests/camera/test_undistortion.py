@@ -22,7 +22,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.undistortion import new_matrix, sources, undistort_pixels, undistorted_camera
+from neurocal_cli.camera.undistortion import new_matrix, sources, undistort_pixels, undistorted_view
 from neurocal_cli.errors import InputError, UsageError
 
 SIZE = (640, 480)
@@ -68,7 +68,7 @@ def test_points_are_those_of_opencv(model: str) -> None:
 @pytest.mark.parametrize("skew", slow_but((True,), [True, False]))
 def test_points_go_there_and_back(model: str, skew: bool) -> None:
     cam = camera(model, skew)
-    new, seen = undistorted_camera(cam), inside()
+    new, seen = undistorted_view(cam), inside()
     corrected = undistort_pixels(cam, new, seen)
     assert np.abs(corrected - seen).max() > 3
     assert np.column_stack(sources(cam, new, *corrected.T)) == pytest.approx(seen, abs=1e-9)
@@ -76,7 +76,7 @@ def test_points_go_there_and_back(model: str, skew: bool) -> None:
 
 def test_without_a_lens_points_stay() -> None:
     seen, cam = inside(), camera("none", True)
-    assert undistort_pixels(cam, undistorted_camera(cam), seen) == pytest.approx(seen, abs=1e-12)
+    assert undistort_pixels(cam, undistorted_view(cam), seen) == pytest.approx(seen, abs=1e-12)
 
 
 @pytest.mark.parametrize("skew", [True, False])
@@ -95,7 +95,7 @@ def test_a_zoomed_camera_is_that_of_the_corrected_points() -> None:
     points = through(flat, "k1k2", LENSES["k1k2"]).points()
     cam = Camera(flat.intrinsics, Distortion("k1k2", LENSES["k1k2"]), flat.image_size)
     found = calibrate(undistort_points(points, cam, alpha=0.0), distortion="none")
-    assert pytest.approx(undistorted_camera(cam, 0.0).A, rel=1e-6, abs=1e-8) == found.intrinsics.A
+    assert pytest.approx(undistorted_view(cam, alpha=0.0).A, rel=1e-6, abs=1e-8) == found.intrinsics.A
 
 
 @pytest.mark.parametrize("model", slow_but(("thin_prism", "tilted", "fisheye", "omnidir"), BENDING))
@@ -105,7 +105,7 @@ def test_covariances_are_those_of_many_points(model: str) -> None:
     C = np.array([[0.04, 0.01, 0.02]])
     square = C[0, [0, 1, 1, 2]].reshape(2, 2)
     cloud = seen + np.random.default_rng(0).multivariate_normal([0, 0], square, 20000)
-    expected = np.cov(undistort_pixels(cam, undistorted_camera(cam, 0.3), cloud).T)[[0, 0, 1], [0, 1, 1]]
+    expected = np.cov(undistort_pixels(cam, undistorted_view(cam, alpha=0.3), cloud).T)[[0, 0, 1], [0, 1, 1]]
     points = Correspondences(np.zeros((1, 3)), seen, image_size=SIZE, covariance=C)
     found = undistort_points(points, cam, 0.3).covariance
     assert found is not None
@@ -116,7 +116,7 @@ def test_covariances_are_those_of_many_points(model: str) -> None:
 def test_a_direction_of_measurement_stays_across_the_edge(model: str) -> None:
     cam = camera(model, True)
     seen, edge = np.array([600.0, 30.0]), np.array([0.6, 0.8])
-    ends = undistort_pixels(cam, undistorted_camera(cam, 0.3), seen + 0.01 * np.outer([-1, 1], edge))
+    ends = undistort_pixels(cam, undistorted_view(cam, alpha=0.3), seen + 0.01 * np.outer([-1, 1], edge))
     across = np.array([[-5.6, 4.2], [0.0, 0.0]])
     points = Correspondences(np.zeros((2, 3)), np.array([seen, seen]), image_size=SIZE, across=across)
     turned = undistort_points(points, cam, 0.3).across
@@ -149,7 +149,7 @@ def test_what_belongs_to_points_is_carried_over() -> None:
     assert not np.allclose(done.covariance, points.covariance)
     assert done.across is not None
     assert done.image_center == pytest.approx(
-        undistort_pixels(cam, undistorted_camera(cam), np.array([[300.0, 260.0]]))[0]
+        undistort_pixels(cam, undistorted_view(cam), np.array([[300.0, 260.0]]))[0]
     )
 
 
@@ -172,7 +172,7 @@ def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
     k = np.zeros(5)
     k[: len(cam.distortion.coefficients)] = cam.distortion.coefficients
     theirs, _ = cv2.getOptimalNewCameraMatrix(cam.A, k, SIZE, alpha)
-    assert pytest.approx(np.asarray(theirs), abs=2.0) == undistorted_camera(cam, alpha).A
+    assert pytest.approx(np.asarray(theirs), abs=2.0) == undistorted_view(cam, alpha=alpha).A
 
 
 @pytest.mark.parametrize("model", slow_but(("plumb_bob", "tilted", "fisheye", "omnidir", "rich"), BENDING))
@@ -183,12 +183,12 @@ def test_alpha_0_shows_only_seen_pixels_and_alpha_1_all_of_them(model: str, skew
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
     some = (u % 639 == 0) | (v % 479 == 0) | ((u % 9 == 4) & (v % 9 == 4))
     u, v = u[some], v[some]
-    su, sv = sources(cam, undistorted_camera(cam, 0.0), u, v)
+    su, sv = sources(cam, undistorted_view(cam, alpha=0.0), u, v)
     assert su.min() > -0.02
     assert sv.min() > -0.02
     assert su.max() < 639.02
     assert sv.max() < 479.02
-    new = undistorted_camera(cam, 1.0)
+    new = undistorted_view(cam, alpha=1.0)
     shown = undistort_pixels(cam, new, np.column_stack([u, v]))
     assert shown.min() > -0.02
     assert (shown.max(axis=0) < [639.02, 479.02]).all()
@@ -203,11 +203,11 @@ def test_a_lens_that_sees_to_the_side_shows_at_most_79_degrees() -> None:
 
 def test_alpha_needs_a_size_and_a_sensible_lens() -> None:
     with pytest.raises(InputError, match="size of the images"):
-        undistorted_camera(replace(camera("k1"), image_size=None), 0.5)
+        undistorted_view(replace(camera("k1"), image_size=None), alpha=0.5)
     with pytest.raises(InputError, match="from 0 to 1"):
-        undistorted_camera(camera("k1"), 2.0)
+        undistorted_view(camera("k1"), alpha=2.0)
     with pytest.raises(InputError, match="no rectangle of valid pixels"):
-        undistorted_camera(Camera(Intrinsics(100, 100, 9000, 240), Distortion("k1", [-0.3]), SIZE), 0.0)
+        undistorted_view(Camera(Intrinsics(100, 100, 9000, 240), Distortion("k1", [-0.3]), SIZE), alpha=0.0)
 
 
 # Images
@@ -271,7 +271,7 @@ def test_an_image_and_its_points_agree() -> None:
     cam = camera("plumb_bob", True)
     x, y = np.meshgrid(np.arange(640), np.arange(480))
     for alpha, (u, v) in zip((None, 0.0, 1.0), ((320.0, 200.0), (500.0, 330.0), (100.0, 90.0)), strict=True):
-        new = undistorted_camera(cam, alpha)
+        new = undistorted_view(cam, alpha=alpha)
         dot = 255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 4.0**2))
         done = undistort_image(dot.astype(np.uint8), cam, alpha).astype(float)
         centre = np.array([(done * x).sum(), (done * y).sum()]) / done.sum()
