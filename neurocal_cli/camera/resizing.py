@@ -58,26 +58,10 @@ def resizing(
 ) -> Resizing:
     """The change of images of the size `old`, by exactly one of the options.
 
-    Parameters
-    ----------
-    old : (width, height) or None [px]
-        It is needed for `to`; a crop must lie within it.
-    to : (width, height), optional [px]
-        The whole image is scaled to this size.
-    scale : float, optional
-        New over old; the new size is rounded.
-    crop : (left, top, width, height), optional [px]
-        The part that is kept.
-    binning : int, optional
-        Number of pixels, along u and along v, that become one. Those left over at the right and the bottom
-        are dropped.
-
-    Raises
-    ------
-    UsageError
-        None of the options, or several.
-    InputError
-        The old size is needed and not known, a crop reaches out of the image, or nothing would be left.
+    `to` is the new size of the whole image, and `crop` the left, top, width and height of the part that is
+    kept [px]. With `scale`, new over old, the new size is rounded. With `binning`, as many pixels along u and
+    along v become one, and those left over at the right and the bottom are dropped. Raises UsageError for
+    none or several, and InputError for a part or a size that does not exist.
     """
     if sum(option is not None for option in (to, scale, crop, binning)) != 1:
         raise UsageError("give one of --to W H, --scale S, --crop U V W H and --binning N")
