@@ -54,6 +54,9 @@ def _check_each_view(views: Views) -> None:
         name, reason = next(iter(found.items()))
         more = list(found.values()).count(reason) - 1
         many = f" (and {more} more views)" if more else ""
+        if views.n_views > 1 and views.distinct.max() < 4:
+            wand = "a wand or single markers calibrate no camera, so show a board to each"
+            reason = f"{reason.split(';')[0]}; {wand}"
         raise DegenerateGeometryError(f"view {name!r}{many}: {reason}")
 
 

@@ -182,6 +182,12 @@ def test_points_on_one_line_are_named_with_their_view(type: int) -> None:
     refused(points, "view 'v1'", "on one line", "spread over a plane or in space", **GIVEN[type])
 
 
+@pytest.mark.parametrize(("n", "words"), [(1, "there is only one point"), (2, "all points lie on one line")])
+def test_a_wand_or_single_markers_are_told_to_calibrate_no_camera(n: int, words: str) -> None:
+    wand = see([BOARD[[0, 8][:n]]] * 3, [AHEAD, tilted(1), tilted(2)])
+    refused(wand, words, "a wand or single markers", "show a board to each")
+
+
 @pytest.mark.parametrize("type", [1, 2, 3])
 def test_one_world_point_for_all_rows_points_to_the_columns(type: int) -> None:
     points = Correspondences(np.ones((9, 3)), np.random.default_rng(0).uniform(0, 400, (9, 2)))

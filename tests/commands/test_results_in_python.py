@@ -30,6 +30,7 @@ from neurocal_cli import (
     report,
     triangulate,
 )
+from neurocal_cli.camera import argument_kinds
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 
 
@@ -216,6 +217,14 @@ def test_arguments_of_another_kind_are_named_with_what_to_give() -> None:
     ):
         with pytest.raises(InputError, match=told):
             call()  # type: ignore[no-untyped-call]
+
+
+def test_only_what_a_user_gives_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(argument_kinds, "_taken", lambda name, value, kinds: seen.append(name) or value)
+    calibrate(read_points(SAMPLES / "flat.csv"), distortion="none")
+    assert {"points", "distortion"} <= set(seen)
+    assert not {"R", "t"} & set(seen)  # of the poses of the views
 
 
 def test_a_rig_of_two_cameras_is_a_rig_of_any_number() -> None:
