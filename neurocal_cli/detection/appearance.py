@@ -24,7 +24,9 @@ ones. Squares that are not of one level have markers in them.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import Image, interpolate
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density
@@ -49,35 +51,56 @@ _LABELLED = 1 / 8  # of the marks, beside which there may be ink, or which are p
 _OFF = 0.1  # px, from where those around a mark predict it
 _SIZES = 0.05  # px rms, of the radius from a smooth change
 _LONG = 0.06  # px, of two periods of most outlines by the angle, beyond noise
-# px, of three and more periods of the mean outline, beyond what the marks differ by; the latter is for
-# described boards, which may be drawn in whole pixels.
-_CORNERED = 0.012, 0.05
+# px, of three to seven periods of the mean outline, beyond twice what the marks differ by; pixels have four.
+_CORNERED = np.array([0.004, 0.012, 0.004, 0.004, 0.004])
+_CORNERED_DRAWN = 0.05  # px, the same for described boards, which may be drawn in whole pixels
+_HEXAGON = 6  # periods
 _INKS = 0.013  # rms, of the share of the paper's light from a smooth change
 _MIXED = 0.007  # rms, of the light by the distance from that of a disc or a ring
 _SIGNED = 0.06  # spread of the light within most marks beyond that around them
 _RULED = 0.015  # change of the light in the paper between the marks
 
 
-def departure_from_circles(light: Image, places: Array, centre: Array, area: Array, described: bool) -> float:
-    """How far marks (N,) of an area [px^2] at places (N, 2) of a board are from circles on blank paper.
+@frozen_dataclass(eq=False)
+class _Rings:
+    """The light around N marks, on rings of the board."""
 
-    What they depart by is added up in squares, over what grids of circles hardly depart by. Some marks of a
-    `described` board may be hidden, and its outlines be drawn in whole pixels.
-    """
+    off: float  # px, from where those around a mark predict it
+    radius: float  # of marks, in the coordinates of the board
+    scale: float  # px, the same
+    apart: float  # distance of marks
+    shares: Array  # (rings,) of the radius
+    shift: Array  # (rings, rays, 2) from the centre, in the coordinates of the board
+    levels: Array  # (N, rings, rays)
+
+
+def _rings(light: Image, places: Array, centre: Array, area: Array) -> _Rings:
     flattening = flattening_of(places, centre, (light.shape[1], light.shape[0]))
     start, steps = predicted(places, places, centre, flattening, itself=False)
     side = np.sqrt(np.maximum(np.abs(np.linalg.det(steps)), 1e-9))
     away = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
     apart = float(away[away > 0].min())
     radius = min(float(np.median(np.sqrt(area / np.pi) / side)), 0.5 * apart)
-    off = float(np.median(np.hypot(*(centre - start).T)))
-    scale = radius * float(np.median(side))  # px
     # The first angle of each quarter is farthest from the next marks.
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS + (0.25 * np.pi if apart < _STAGGERED else 0.0)
     shares = np.arange(_FIRST, _NEXT * apart / radius, _STEP)
-    rings = radius * shares
-    shift = rings[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    shift = radius * shares[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     levels = interpolate(light, centre[:, None, None] + shift @ steps[:, None])
+    off = float(np.median(np.hypot(*(centre - start).T)))
+    return _Rings(off, radius, radius * float(np.median(side)), apart, shares, shift, levels)
+
+
+def departure_from_circles(
+    light: Image, places: Array, centre: Array, area: Array, described: bool
+) -> tuple[float, float]:
+    """How far marks (N,) of an area [px^2] at places (N, 2) of a board are from circles on blank paper.
+
+    What they depart by is added up in squares, over what grids of circles hardly depart by; the second figure
+    is that of hexagons, of their size and blur, in their place. Some marks of a `described` board may be hidden, and its
+    outlines be drawn in whole pixels.
+    """
+    rings = _rings(light, places, centre, area)
+    radius, scale, shares, levels = rings.radius, rings.scale, rings.shares, rings.levels
     middle, edge = np.count_nonzero(shares < 1), np.count_nonzero(shares < _AROUND) - 1
     # A ring may be light in its middle.
     profile = np.median(levels[..., :: _RAYS // 4].mean(axis=2), axis=0)
@@ -102,10 +125,10 @@ def departure_from_circles(light: Image, places: Array, centre: Array, area: Arr
     inks = odd(ink) / max(1 - float(np.median(ink)), 0.1)
     levels -= ring[:, inner, None, None]
     levels /= np.where(np.abs(contrast) < 1, 1.0, contrast)[:, None, None]
-    mean = levels.mean(axis=0)
-    darker = np.flatnonzero(mean[: outer + 1].mean(axis=1) < 0.5)
+    mean = levels.mean(axis=(0, 2))
+    darker = np.flatnonzero(mean[: outer + 1] < 0.5)
     if not len(darker):
-        return np.inf
+        return np.inf, np.inf
     half = int(darker[-1])
     across = levels[:, inner : outer + 1].mean(axis=2)
     beyond = np.maximum((across > 0.5).argmax(axis=1), 1)
@@ -115,28 +138,36 @@ def departure_from_circles(light: Image, places: Array, centre: Array, area: Arr
     within, around = (float(np.median(levels[:, k].std(axis=1))) for k in (_INSIDE, edge))
     signed = np.sqrt(max(within**2 - around**2, 0.0))
     step = abs(profile[outer] - profile[inner])
-    blur = _STEP * radius * step / max(np.sqrt(2 * np.pi) * np.abs(np.diff(profile)).max(), 1e-9)
+    blur = _STEP * step / max(np.sqrt(2 * np.pi) * np.abs(np.diff(profile)).max(), 1e-9)  # of the radius
     # The light is half-way between this ring and the next one.
     further = min(half + 1, len(mean) - 1)
-    level, next_level = mean[[half, further]].mean(axis=1)
-    between = (0.5 - level) / max(next_level - level, 0.5 - level, 1e-9)
+    between = (0.5 - mean[half]) / max(mean[further] - mean[half], 0.5 - mean[half], 1e-9)
     outline = levels[:, half] + between * (levels[:, further] - levels[:, half])
+    long, cornered, hexagons = _outline(np.sqrt(2 * np.pi) * blur * scale * outline, described)
+    reach = shares[half] + between * _STEP  # of the outline; blurred marks seem larger
+    hexagons *= scale * reach * np.exp(-0.5 * (_HEXAGON * blur / reach) ** 2)
+    near = radius * shares < 0.5 * rings.apart
+    mixed = _misfit(mean[near], shares[near])
+    blank = reach + _BLUR * blur
+    ruled = _ruled(rings, (shares > blank) & (shares < rings.apart / radius - blank), places)
+    found = np.array([rings.off, inks, sizes, mixed, long, signed, ruled])
+    usual = [_OFF, _INKS, _SIZES, _MIXED, _LONG, _SIGNED, _RULED]
+    others = float(((found / usual) ** 2).sum())
+    return others + cornered**2, others + float(hexagons) ** 2
+
+
+def _outline(outline: Array, described: bool) -> tuple[float, float, float]:
+    """What outlines (N, rays) [px] depart by from ellipses: in two periods [px], and in more over the usual.
+
+    The last figure is what hexagons with a radius of 1 px depart by over the usual.
+    """
     periods = np.fft.rfft(outline, axis=1)[:, 2 : _RAYS // 2] / _RAYS
-    periods *= np.sqrt(2 * np.pi) * blur * scale / radius
     power = np.median(np.abs(periods) ** 2, axis=0)
     long = np.sqrt(max(power[0] - power[1:].mean(), 0.0))  # noise is alike in all
     corners = periods[:, 1:].mean(axis=0)
     noise = np.sqrt((np.abs(periods[:, 1:] - corners) ** 2).mean(axis=0) / len(periods))
-    cornered = float((np.abs(corners) / np.hypot(noise, _CORNERED[described])).max())
-    blank = rings[half] + between * _STEP * radius + _BLUR * blur
-    clear = (rings > blank) & (rings < apart - blank)
-    at = places[:, None, None] + shift[clear]
-    inside = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
-    near = rings < 0.5 * apart
-    mixed = _misfit(mean[near].mean(axis=1), shares[near])
-    found = np.array([off, inks, sizes, mixed, long, signed, _ruled(levels[:, clear], inside)])
-    usual = [_OFF, _INKS, _SIZES, _MIXED, _LONG, _SIGNED, _RULED]
-    return float(((found / usual) ** 2).sum()) + cornered**2
+    usual = np.hypot(2 * noise, _CORNERED_DRAWN if described else _CORNERED)
+    return float(long), float((np.abs(corners) / usual).max()), 1 / (_HEXAGON**2 * float(usual[_HEXAGON - 3]))
 
 
 def _misfit(light: Array, at: Array) -> float:
@@ -167,25 +198,40 @@ def _peak(at: Array, values: Array) -> float:
     return float(at[k] + np.clip(0.5 * (after - before) / bend, -1, 1) * (at[1] - at[0]))
 
 
-def _ruled(levels: Array, within: Array) -> float:
-    """Greatest change by the angle of the mean light (N, rings, rays), beyond what noise makes of it.
+def _ruled(rings: _Rings, clear: NDArray[np.bool_], places: Array) -> float:
+    """Greatest change of the mean light in `clear` rings between the marks, beyond what noise makes of it.
 
-    Only the light `within` the board counts, and not its slope, nor that all marks are long.
+    It changes by the angle, or is another one beside every second mark. Only the light within the board
+    counts, and not its slope, nor that all marks are long.
     """
-    if not levels[0].size:
+    if not clear.any():
         return 0.0
+    levels, at = rings.levels[:, clear], places[:, None, None] + rings.shift[clear]
+    within = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
     # Numbers may label a few of the marks.
     odd = np.where(within, np.abs(levels - np.median(levels, axis=0)), 0.0).max(axis=(1, 2))
     plain = odd <= np.quantile(odd, 1 - _LABELLED)
-    levels, within = levels[plain], within[plain]
-    count = np.maximum(within.sum(axis=0), 1)
-    mean = np.where(within, levels, 0.0).sum(axis=0) / count
+    levels, within, places = levels[plain], within[plain], places[plain]
+    count, mean = _mean(levels, within)
     # Lines between some of the marks are no noise.
-    noise = np.sqrt(np.median((np.where(within, levels - mean, 0.0) ** 2).sum(axis=0) / count) / count)
+    noise = np.sqrt(np.median((np.where(within, levels - mean, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1)))
     smooth = np.fft.rfft(mean, axis=1)
     smooth[:, 3:] = 0
-    away = np.abs(mean - np.fft.irfft(smooth, _RAYS, axis=1))
-    return float((away - _SURE * noise).max(initial=0.0))
+    expected = np.fft.irfft(smooth, _RAYS, axis=1)
+    x, y = np.rint(places - places[0]).astype(int).T
+    second = (x if rings.apart < _STAGGERED else (x + y) // 2) % 2 + 2 * (y % 2)
+    result = 0.0
+    for some in (second >= 0, *(second == k for k in range(4))):
+        count, mean = _mean(levels[some], within[some])
+        away = np.abs(mean - expected) - _SURE * noise / np.sqrt(np.maximum(count, 1))
+        result = max(result, float(away[count > 0].max(initial=0.0)))
+    return result
+
+
+def _mean(levels: Array, within: Array) -> tuple[Array, Array]:
+    """Number of the marks whose light counts, and its mean."""
+    count = within.sum(axis=0)
+    return count, np.where(within, levels, 0.0).sum(axis=0) / np.maximum(count, 1)
 
 
 _MOST, _FEWEST = 60, 2  # squares of a colour that are examined

@@ -13,6 +13,7 @@ from support.marked import errors_of, marked_scene, plane_of, taken
 from support.places import SAMPLES
 from support.real_data import RealFiles
 
+from neurocal_cli.detection.appearance import departure_from_circles
 from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
 from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, seen_circles
 from neurocal_cli.detection.detect import detect_points
@@ -304,17 +305,56 @@ def test_circles_may_be_labelled_and_sharpened() -> None:
     assert seen_circles(sharpened) is not None
 
 
-@pytest.mark.parametrize("corners", [0, 6])
-def test_blurred_nuts_are_no_circles(corners: int) -> None:
+@pytest.mark.parametrize(
+    ("corners", "radius", "blur"), [(0, 40, 1.7), (6, 40, 1.7), (0, 18, 1.4), (5, 18, 1.8), (6, 18, 1.4)]
+)
+def test_blurred_nuts_are_no_circles(corners: int, radius: int, blur: float) -> None:
     image = np.full((960, 1280), 60, np.uint8)
     angle = 2 * np.pi * np.arange(corners or 360) / (corners or 360)
-    shape = np.stack([290 + 40 * np.cos(angle), 270 + 40 * np.sin(angle)], axis=-1)
+    shape = np.array([290, 270]) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     for row in range(4):
         for column in range(6):
             places = np.rint(8 * (shape + 140 * np.array([column, row]))).astype(np.int32)
             cv2.fillPoly(image, [places], (170,), cv2.LINE_AA, 3)
     seen = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    assert (seen_circles(cv2.GaussianBlur(seen, (0, 0), 1.7)) is None) == bool(corners)
+    assert (seen_circles(cv2.GaussianBlur(seen, (0, 0), blur)) is None) == bool(corners)
+
+
+@pytest.mark.parametrize("gap", [0, 4])
+def test_dice_that_nearly_touch_are_no_circles(gap: int) -> None:
+    image = np.full((960, 1280), 210, np.uint8)
+    for row in range(8):
+        for column in range(12):
+            cv2.circle(image, (150 + 80 * column, 150 + 80 * row), 20, (40,), -1, cv2.LINE_AA)
+    for end in range(190, 1110, 160):
+        image[110:750, end : end + gap] = 140
+    for end in range(190, 750, 160):
+        image[end : end + gap, 110:1070] = 140
+    seen = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    assert (seen_circles(cv2.GaussianBlur(seen, (0, 0), 1.2)) is None) == bool(gap)
+
+
+@pytest.mark.parametrize("blur", [1.0, 1.4])
+def test_what_hexagons_depart_by_is_known(blur: float) -> None:
+    """It is known from circles, and so whether the image can tell both apart."""
+    row, column = (x.ravel() for x in np.indices((6, 7)))
+    places = np.stack([column, row], axis=-1).astype(float)
+    centre = np.array([36.0, 24.0]) - 0.375 + 30.0 * places
+    v, u = np.indices((800, 1000))
+    du, dv = (u - 144 + 60) % 120 - 60, (v - 96 + 60) % 120 - 60
+    turned = (np.arctan2(dv, du) + 0.1) % (np.pi / 3) - np.pi / 6
+    found = []
+    for reach in (18 * np.cos(np.pi / 6) / np.cos(turned), 16.4):  # of a hexagon, and of a circle of its area
+        image = np.where(np.hypot(du, dv) < reach, 50, 200).astype(np.float32)
+        light = cv2.resize(
+            cv2.GaussianBlur(image, (0, 0), 4 * blur), (250, 200), interpolation=cv2.INTER_AREA
+        )
+        area = np.full(len(places), np.pi * 4.1**2)
+        found.append(departure_from_circles(light, places, centre, area, described=False))
+    (hexagons, _), (circles, expected) = found
+    assert circles < 5
+    assert 0.4 < expected / hexagons < 4
+    assert 5 * circles < expected
 
 
 def test_circles_that_are_not_clear_need_a_second_image() -> None:

@@ -253,7 +253,8 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     placed = _placed(plane, blobs, index[kept], at[kept], grey)
     places = plane.spread(placed.place.astype(float))
     light = grey.astype(np.float32)
-    if departure_from_circles(light, places, placed.centre, placed.area, described=True) > _DEPARTURE:
+    departure, _ = departure_from_circles(light, places, placed.centre, placed.area, described=True)
+    if departure > _DEPARTURE:
         raise NoBoardError(
             "the image shows marks in rows and columns, but no circles of one colour on blank paper"
         )

@@ -32,7 +32,7 @@ _LARGE = 1.5e-4  # of the image; where circles are so large, a first look misses
 _AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
 # Greatest departure from circles: in any image, and in one that needs no second one that agrees, as other
-# things in rows seldom do.
+# things in rows seldom do. There, blurred hexagons would depart by more.
 _DEPARTURE, _CLEARLY = 11.0, 5.0
 _MOST_OF_SIDE = 0.6  # of the places beside a pattern; a row there is full, or the pattern is not
 
@@ -84,11 +84,12 @@ def _seen_in(
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    departure = departure_from_circles(grey.astype(np.float32), places, centre, area, described=False)
+    light = grey.astype(np.float32)
+    departure, of_hexagons = departure_from_circles(light, places, centre, area, described=False)
     if departure > _DEPARTURE:
         return None
     full = share == 1
-    whole = full and departure < _CLEARLY and _ends_seen(places, centre, area, grey.shape)
+    whole = full and departure < _CLEARLY < of_hexagons and _ends_seen(places, centre, area, grey.shape)
     return replace(seen, whole=whole, full=full)
 
 
