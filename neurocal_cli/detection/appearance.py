@@ -96,8 +96,8 @@ def departure_from_circles(
     """How far marks (N,) of an area [px^2] at places (N, 2) of a board are from circles on blank paper.
 
     What they depart by is added up in squares, over what grids of circles hardly depart by; the second figure
-    is that of hexagons, of their size and blur, in their place. Some marks of a `described` board may be hidden, and its
-    outlines be drawn in whole pixels.
+    is that of hexagons, of their size and blur, in their place. Some marks of a `described` board may be
+    hidden, and its outlines be drawn in whole pixels.
     """
     rings = _rings(light, places, centre, area)
     radius, scale, shares, levels = rings.radius, rings.scale, rings.shares, rings.levels
@@ -246,10 +246,10 @@ _CENTRE = weights_within(0.5 + 0.15 * np.concatenate([[[0, 0]], _TO_SIDES, _TO_C
 _FLAT = 18  # steps from which a square has one level: 0.2 of it
 # Greatest loss at the corners on the diagonal: squares, and px. Chessboards lose at most 0.02, circles 0.13.
 _ROUNDED, _ROUNDED_PX = 0.025, 0.5
-# Greatest difference of the places of the edges along both axes, in squares (0.009 in 206 rendered boards,
-# 0.007 in photographs; shifted rows 0.02 and more) and in px, beyond this share of the difference of the
+# Greatest difference of the places of the edges along both axes, in squares (0.0025 in 180 rendered boards,
+# 0.007 in photographs; shifted rows 0.014 and more) and in px, beyond this share of the difference of the
 # widths of the blur, by which overexposed light spreads.
-_UNEVEN, _UNEVEN_PX, _SPREAD = 0.015, 0.1, 0.3
+_UNEVEN, _UNEVEN_PX, _SPREAD = 0.01, 0.1, 0.3
 # Greatest spread of a square of one level, over the contrast: 0.04 in rendered and photographed chessboards,
 # and 0.1 and more on boards with markers.
 _LEVEL = 0.07

@@ -172,7 +172,7 @@ def _joined(outlines: list[NDArray[Any]]) -> tuple[NDArray[np.intp], Array]:
     return of, np.concatenate(outlines).astype(float)
 
 
-def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) -> NDArray[np.bool_]:
+def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Whether ellipses (n,) are darker within their outlines than around them; a ring is light in its middle.
 
     Windows find the surroundings of discs, too, whose outer outlines are no edges.
@@ -187,8 +187,7 @@ def _darker(outlines: list[NDArray[Any]], centre: Array, image: NDArray[Any]) ->
         """Medians along the outlines, enlarged by a factor."""
         places = np.rint(centre[of] + radii * (points - centre[of])).astype(int)
         u, v = np.clip(places, 0, np.array(image.shape[::-1]) - 1).T
-        levels = image[v, u].astype(float)
-        levels = levels[np.lexsort((levels, of))]
+        levels = np.sort(256 * of + image[v, u]) % 256  # of each outline
         return np.asarray(0.5 * (levels[first + (count - 1) // 2] + levels[first + count // 2]))
 
     return np.asarray(level(_INSIDE) < level(_OUTSIDE) - _STEPS[0])

@@ -259,7 +259,7 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
     for border in (1, 2):
         for bits in sorted(set(DICTIONARIES.values())):
             light, good = _cells(grey, H, bits, border)
-            if not good.any():
+            if np.count_nonzero(good) < _FEWEST:
                 continue
             which = np.flatnonzero(good)
             for dictionary in USUAL:
