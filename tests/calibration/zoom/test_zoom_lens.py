@@ -28,6 +28,7 @@ from neurocal_cli.calibration.zoom.evaluation import (
     thin_plate_matrix,
 )
 from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens_cameras
+from neurocal_cli.calibration.zoom.initialisation import _predicts_better
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
 from neurocal_cli.calibration.zoom.settings import LensPoints
@@ -131,6 +132,19 @@ def test_distortion_is_chosen_and_follows_the_zoom() -> None:
     np.testing.assert_allclose(k1, true, atol=0.03)
     evaluation = evaluate_lens(lens, seen("c", between(5, 3), seed=10, bends=True))
     assert evaluation.rmse_px < 1.12 * FLOOR
+
+
+def test_a_richer_model_must_predict_settings_better_in_sum_and_in_proportion() -> None:
+    """Simulated settings of focus, with k2 of 0.05 and without: one in seven tells most of it."""
+    without = [0.0600, 0.0410, 0.0402, 0.0395, 0.0410, 0.0390, 0.0375]
+    gains = [0.052, -0.004, 0.002, 0.003, 0.015, 0.006, 0.021]
+    keys = [(float(k),) for k in range(7)]
+    known = dict(zip(keys, without, strict=True))
+    assert _predicts_better({key: known[key] * np.exp(-g) for key, g in zip(keys, gains, strict=True)}, known)
+    assert not _predicts_better({key: 1.001 * known[key] for key in keys}, known)
+    assert not _predicts_better(
+        {**known, keys[0]: 0.055, **{key: 1.03 * known[key] for key in keys[1:]}}, known
+    )
 
 
 @pytest.mark.slow
