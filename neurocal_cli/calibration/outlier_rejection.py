@@ -14,7 +14,8 @@ Few points fit better without some of them whether these are wrong or not, up to
 equations are left, the evidence decides. For s spare equations with the squared error c, its logarithm is
 log Gamma(s / 2) - s / 2 log(pi c), with the noise level integrated out (Jeffreys' prior). Each of k outliers
 is anywhere in the image, of area F, and any k of n points may be those: - k log F - log(n over k).
-It is asked with the lens of all points first; the lens is selected again only where that favours outliers.
+It is asked with the lens of all points first, or k1 where outliers hide that there is one. The lens is
+selected again only where that favours outliers.
 
 A large error that agrees with normal noise begins the search as well, because it may hide outliers. They are
 left out only if the error falls to less than half without them, which trimming noise does not reach.
@@ -110,9 +111,10 @@ def fit_robustly(
         return first, Rejected()
     if options.distortion == "auto" and _has_few_spare_equations(first):
         with suppress(DegenerateGeometryError):
-            same_lens = replace(options, distortion=first.state.model)
-            found = _agreeing(first.problem, same_lens, first, None)
-            if not _is_more_probable(*_searched(problem.points, same_lens, *found), first):
+            named = first.problem.with_model("k1") if first.state.model == "none" else first.problem
+            one_lens = replace(options, distortion=named.distortion.model)
+            found = _agreeing(named, one_lens, first, None)
+            if not _is_more_probable(*_searched(problem.points, one_lens, *found), first):
                 return first, Rejected()
     try:
         kept, solution = _searched(problem.points, options, *_agreeing(problem, options, first, None))

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.distorted import through
+from support.scenes import random_flat_set
 from support.targets import SIZE, offsets, views_of
 
 from neurocal_cli import Correspondences, calibrate
@@ -95,3 +97,17 @@ def test_noise_of_few_views_of_nine_points_is_no_outlier() -> None:
         view = np.repeat(np.arange(n), 9)
         points = Correspondences(np.tile(board, (n, 1)), np.concatenate(pixels), view, image_size=(640, 480))
         assert not calibrate(points).n_rejected
+
+
+def test_an_outlier_that_hides_the_lens_is_found_among_few_points() -> None:
+    rng = np.random.default_rng([28, 77])
+    n = int(rng.integers(5, 16))
+    scene = random_flat_set(rng, n, False, cols=3, rows=3, f=float(rng.uniform(700, 1600)), width=1280)
+    points = through(scene, "k1k2", [-0.05, 0.01]).points(0.3, rng)
+    rng.integers(1, 4)
+    wrong = rng.choice(len(points), 1, replace=False)
+    pixels = points.pixels.copy()
+    pixels[wrong] += rng.normal(0, 15, (1, 2))
+    found = calibrate(replace(points, pixels=pixels), skew=False)
+    assert found.distortion_model == "k1"  # with the outlier, none
+    assert set(wrong) <= set(found.rejected.rows.tolist())
