@@ -208,30 +208,21 @@ def _ruled(rings: _Rings, clear: NDArray[np.bool_], places: Array) -> float:
         return 0.0
     levels, at = rings.levels[:, clear], places[:, None, None] + rings.shift[clear]
     within = ((at >= places.min(axis=0)) & (at <= places.max(axis=0))).all(axis=-1)
+    usual = np.median(levels, axis=0)
+    levels = np.where(within, levels, usual)
     # Numbers may label a few of the marks.
-    odd = np.where(within, np.abs(levels - np.median(levels, axis=0)), 0.0).max(axis=(1, 2))
+    odd = np.abs(levels - usual).max(axis=(1, 2))
     plain = odd <= np.quantile(odd, 1 - _LABELLED)
-    levels, within, places = levels[plain], within[plain], places[plain]
-    count, mean = _mean(levels, within)
-    # Lines between some of the marks are no noise.
-    noise = np.sqrt(np.median((np.where(within, levels - mean, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1)))
-    smooth = np.fft.rfft(mean, axis=1)
+    levels, (x, y) = levels[plain], np.rint(places[plain] - places[0]).astype(int).T
+    smooth = np.fft.rfft(levels.mean(axis=0), axis=1)
     smooth[:, 3:] = 0
-    expected = np.fft.irfft(smooth, _RAYS, axis=1)
-    x, y = np.rint(places - places[0]).astype(int).T
+    levels -= np.fft.irfft(smooth, _RAYS, axis=1)
+    # Lines between some of the marks are no noise.
+    noise = np.sqrt(np.median(levels.var(axis=0)))
     second = (x if rings.apart < _STAGGERED else (x + y) // 2) % 2 + 2 * (y % 2)
-    result = 0.0
-    for some in (second >= 0, *(second == k for k in range(4))):
-        count, mean = _mean(levels[some], within[some])
-        away = np.abs(mean - expected) - _SURE * noise / np.sqrt(np.maximum(count, 1))
-        result = max(result, float(away[count > 0].max(initial=0.0)))
-    return result
-
-
-def _mean(levels: Array, within: Array) -> tuple[Array, Array]:
-    """Number of the marks whose light counts, and its mean."""
-    count = within.sum(axis=0)
-    return count, np.where(within, levels, 0.0).sum(axis=0) / np.maximum(count, 1)
+    some = [levels, *(levels[second == k] for k in np.unique(second))]
+    away = (np.abs(one.mean(axis=0)) - _SURE * noise / np.sqrt(len(one)) for one in some)
+    return float(np.max(list(away), initial=0.0))
 
 
 _MOST, _FEWEST = 60, 2  # squares of a colour that are examined
