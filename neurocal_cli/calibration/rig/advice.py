@@ -24,7 +24,7 @@ from neurocal_cli.calibration.advice import (
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.covariance import covariance_by_points
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.space_uncertainty import fitted, pixel_moves
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, has_points, pixel_moves, steps_between
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, by_motion, median
 from neurocal_cli.errors import InputError
@@ -63,7 +63,7 @@ def advise_rig(rig: Rig, count: int = 3) -> RigAdvice:
         number of views is not 1 to 1000.
     """
     refuse_count(count)
-    if not rig.frames or not all(len(camera.points) for camera in rig.cameras.values()):
+    if not has_points(rig):
         raise InputError("the rig holds no points; give a file that was not written with --lean")
     if any(camera.image_size is None for camera in rig.cameras.values()):
         raise InputError("the size of the images is unknown; calibrate with --image-size W H")
@@ -124,13 +124,9 @@ class _Pair:
 
     def std(self, own: Array) -> float:
         """Largest std of where the second camera sees what the first one sees, by their own covariance."""
-        (first, second), rigs = self.poses, self.fit.state.columns.rigs
-        R, whole = second.R @ first.R.T, np.zeros((3, self.fit.state.columns.n_shared))
-        J = by_motion(self.middle[None] @ second.R.T, self.fit.problem.unit)[0]
-        for side, moved in zip(self.indices, (-J @ np.kron(np.eye(2), R), J), strict=True):
-            if side:
-                whole[:, rigs[side]] = moved
-        by_own = whole[:, self.columns]
+        first, second = self.poses
+        turned = second.to_camera(self.middle[None]) - second.relative_to(first).t
+        by_own = (by_motion(turned)[0] @ steps_between(self.fit, *self.indices))[:, self.columns]
         return float(np.sqrt(max(np.linalg.eigvalsh(by_own @ own @ by_own.T)[-1], 0.0)))
 
     @cached_property

@@ -165,9 +165,7 @@ def is_suspect(why: str) -> bool:
 
 def at_fit(problem: RigProblem, fit: RigFit) -> RigFit:
     """A problem at the cameras and the rig of a fit of some of its views, with the frames' poses refined."""
-    state = problem.start(
-        [Pose(R, t * problem.unit) for R, t in zip(fit.state.R[1:], fit.state.t[1:], strict=True)]
-    )
+    state = problem.start(problem.poses(fit.state)[1:])
     state = replace(state, cameras=fit.state.cameras)
     return adjust_rig(problem, state, np.zeros(state.columns.n_shared, dtype=bool))
 

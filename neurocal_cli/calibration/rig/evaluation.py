@@ -102,8 +102,7 @@ def evaluate_rig(rig: Rig, points: Points | None = None) -> RigEvaluation:
         raise InputError("the rig has no points of its own; give the points to evaluate it on")
     number, frame, camera, pixels, world = _rows(points, frames)
     found = triangulate_many(rig, number, camera, pixels)
-    first = np.zeros(len(found.points), dtype=np.intp)  # a row of each point
-    first[number[::-1]] = np.arange(len(number))[::-1]
+    first = np.unique(number, return_index=True)[1]  # a row of each point
     names = [name for name in frames.names if name in poses]
     place = {name: k for k, name in enumerate(names)}
     view = np.array([place.get(name, -1) for name in frames.names])[frame[first]]

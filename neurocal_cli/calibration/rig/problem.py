@@ -309,6 +309,10 @@ class RigProblem:
         delay = np.zeros(len(rig))
         return RigState(self.cameras, R, t, view_R, view_t, delay, self.motion is not None)
 
+    def poses(self, state: RigState) -> list[Pose]:
+        """The poses of all cameras, X_c = R_c X_first + t_c, in world units."""
+        return [Pose(R, t * self.unit) for R, t in zip(state.R, state.t, strict=True)]
+
     def camera(self, state: RigState, side: int) -> CameraState:
         """One camera with the poses of its own views."""
         view = self.observations[side].view

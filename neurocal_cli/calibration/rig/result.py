@@ -37,7 +37,7 @@ def assembled(fit: RigFit, names: Sequence[str], found: Covariance) -> Rig:
     problem, state, columns = fit.problem, fit.state, fit.state.columns
     first = problem.calibrations[0]
     scale_std = std_of_scale(first.points, first.target)
-    poses = [Pose(R, t * problem.unit) for R, t in zip(state.R[1:], state.t[1:], strict=True)]
+    first_pose, *poses = problem.poses(state)
     covariance = _of_poses(fit, found, poses, scale_std)
     own = [covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(poses))]
     stds = [named_std(block, pose.t) for block, pose in zip(own, poses, strict=True)]
@@ -53,7 +53,7 @@ def assembled(fit: RigFit, names: Sequence[str], found: Covariance) -> Rig:
     several = [{names[k]: view for k, view in views.items()} for views in problem.views if len(views) > 1]
     return Rig(
         dict(zip(names, cameras, strict=True)),
-        dict(zip(names, [Pose(np.eye(3), np.zeros(3)), *poses], strict=True)),
+        dict(zip(names, [first_pose, *poses], strict=True)),
         dict(zip(names, [dict.fromkeys((*POSE_NAMES, "baseline"), 0.0), *stds], strict=True)),
         covariance,
         {next(iter(views.values())): views for views in several},

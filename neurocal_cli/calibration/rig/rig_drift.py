@@ -15,14 +15,12 @@ import numpy as np
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.drift import FEW_VIEWS, SHARE, Drift, find_drift, tail
-from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.covariance import covariance_by_points, following_given, given_covariance
 from neurocal_cli.calibration.rig.fit import fit_rig
-from neurocal_cli.calibration.rig.rig import Rig, StereoRig, relative_steps, steps_by_angles
-from neurocal_cli.calibration.rig.space_uncertainty import fitted, has_points
+from neurocal_cli.calibration.rig.rig import Rig, StereoRig, steps_by_angles
+from neurocal_cli.calibration.rig.space_uncertainty import fitted, has_points, steps_between
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, rotation_vector
-from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 
 Differences = Callable[[str, str], Array]
@@ -206,7 +204,7 @@ def differences(old: Rig, new: Rig) -> Differences:
 
     def between(first: str, second: str) -> Array:
         sides = [(own.index(first), own.index(second)) for own in names]
-        by_old, by_new = (_steps_of(fit, *pair) for fit, pair in zip((before, after), sides, strict=True))
+        by_old, by_new = (steps_between(fit, *pair) for fit, pair in zip((before, after), sides, strict=True))
         apart = by_new @ follow @ d - by_old
         return np.asarray(apart @ known @ apart.T + by_new @ rest @ by_new.T)
 
@@ -223,14 +221,3 @@ def _alike(old: Rig, new: Rig) -> list[str]:
         and camera.intrinsics == before.intrinsics
         and camera.camera.distortion == before.camera.distortion
     ]
-
-
-def _steps_of(fit: RigFit, first: int, second: int) -> Array:
-    """(6, n_shared) steps of the pose from one camera to another, by the unknowns of a rig."""
-    state, unit = fit.state, fit.problem.unit
-    by = relative_steps(*(Pose.exact(state.R[side], unit * state.t[side]) for side in (first, second)))
-    whole = np.zeros((6, state.columns.n_shared))
-    for side, own in zip((first, second), by, strict=True):
-        if side:
-            whole[:, state.columns.rigs[side]] = own * np.repeat([1.0, unit], 3)
-    return whole

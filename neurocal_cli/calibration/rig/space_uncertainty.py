@@ -18,13 +18,12 @@ from neurocal_cli.calibration.rig.covariance import covariance_by_points
 from neurocal_cli.calibration.rig.frames import pair_points
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.result import intrinsics_of
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.rig import Rig, relative_steps
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array, by_motion
 from neurocal_cli.camera.measured import PlaneErrors, Spread
-from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 
 _MOST_POINTS = 400  # most points that are triangulated
@@ -81,6 +80,16 @@ def pixel_moves(fit: RigFit, points: Array, side: int) -> tuple[Array, Array]:
     return by_point @ fit.state.R[side], by_shared
 
 
+def steps_between(fit: RigFit, first: int, second: int) -> Array:
+    """(6, n_shared) steps of the pose from one camera to another [world unit], by what the frames share."""
+    problem, columns = fit.problem, fit.state.columns
+    poses, whole = problem.poses(fit.state), np.zeros((6, columns.n_shared))
+    for side, own in zip((first, second), relative_steps(poses[first], poses[second]), strict=True):
+        if side:
+            whole[:, columns.rigs[side]] = own * np.repeat([1.0, problem.unit], 3)
+    return whole
+
+
 def point_moves(
     fit: RigFit, points: Array, seen: NDArray[np.bool_], noise: Array | None = None
 ) -> tuple[Array, Array]:
@@ -118,7 +127,8 @@ def depth_std(fit: RigFit, first: int, second: int) -> tuple[Array, Array]:
     step = max(1, len(rows.left) // _MOST_POINTS)
     pixels = sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
     cameras = camera_in_pixels(fit, first), camera_in_pixels(fit, second)
-    one, other = (Pose.exact(state.R[side], problem.unit * state.t[side]) for side in (first, second))
+    poses = problem.poses(state)
+    one, other = poses[first], poses[second]
     found = triangulate(*cameras, other.relative_to(one), *pixels)
     kept = ~found.behind
     points = (found.points[kept] - one.t) @ one.R
