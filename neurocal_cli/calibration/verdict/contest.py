@@ -118,15 +118,16 @@ def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False
 
     try:
         held = _held(at_minimum(), worth, RIVALS)
-        if all(one.pattern == "all" for one in held.causes):
+        if not held.causes:
             return held
         lin = at_minimum(field, another_lens)
         between = [one.pattern != "all" and not one.rival.of_board for one in held.causes]
-        if any(between):
-            told = sum(one.evidence for one in held.causes[: between.index(True) + 1])
-            lenses = estimates(lin, held.n, (ANOTHER_LENS,))
-            if any((_fitted(lin, one, held.n) or one).evidence > told + LEVEL for one in lenses):
-                held = _held(lin, worth, (ANOTHER_LENS,))  # what it leaves of others would be guessed
+        told = sum(one.evidence for one in held.causes[: [*between, True].index(True) + 1])
+        lenses = estimates(lin, held.n, (ANOTHER_LENS,))
+        if any((_fitted(lin, one, held.n) or one).evidence > told + LEVEL for one in lenses):
+            held = _held(lin, worth, (ANOTHER_LENS,))  # what it leaves of other causes would be guessed
+        if all(one.pattern == "all" for one in held.causes):
+            return held
         smooth, beside = estimates(lin, held.n, (NEIGHBOURS,)), lin
         for one in held.causes:
             beside = including(beside, one)

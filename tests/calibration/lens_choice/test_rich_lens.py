@@ -290,4 +290,6 @@ def test_a_stretched_image_is_no_rich_lens_and_no_internal_error(real_files: Rea
     points = read_points(path)
     with pytest.raises(DegenerateGeometryError, match="no fisheye with a smooth displacement"):
         calibrate(points, distortion="rich")
-    assert calibrate(points).distortion_model != "rich"
+    found = calibrate(points)
+    assert found.distortion_model != "rich"
+    assert "the distortion model is too simple" in found.verdict.reasons[0]
