@@ -158,7 +158,8 @@ def coefficient_warnings(
     return (f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion",)
 
 
-_CHANCE = 1.645  # sigmas: one clean set in twenty
+CHANCE = 1.645
+"""Standard deviations that one clean set in twenty exceeds."""
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
 _ROUNDING = 1e-15  # least eigenvalue of a covariance with unit diagonal
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
@@ -261,7 +262,7 @@ def _contradict(q: Quadratics, variance: float) -> bool:
     if not (mean > 0 and spread > 0 and variance > 0):
         return False
     statistic = float(((q.g @ root.T) ** 2).sum()) / variance / mean
-    return bool(statistic > exceeded_by_chance(mean**2 / spread, _CHANCE))
+    return bool(statistic > exceeded_by_chance(mean**2 / spread, CHANCE))
 
 
 def jackknife(moves: Array) -> Array:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 
+import numpy as np
 import pytest
-from support.campaign import CONDITIONS, scene
+from support.campaign import CONDITIONS, Array, noise_of_neighbours, scene
 from support.campaign_reference import reference
 from support.slow_cases import slow_but
 
-from neurocal_cli import calibrate
+from neurocal_cli import Pose, calibrate
 from neurocal_cli.errors import DegenerateGeometryError
 
 RESOLVED = 0.02  # std of alpha_u over its value, of a fit that begins at the truth
@@ -34,6 +35,42 @@ def judge(seed: int) -> tuple[str, str]:
 @pytest.mark.parametrize("seed", slow_but((5007,), range(5007, 5014)))
 def test_every_condition_is_met(seed: int) -> None:
     assert judge(seed)[1] == ""
+
+
+def over_std(seed: int) -> tuple[list[float], Array]:
+    """Errors over std of a camera from noise that neighbours share, and (V, 3) those of its views' angles."""
+    points, truth = scene(seed)
+    found = calibrate(noise_of_neighbours(points, truth))
+    true = dict(zip(("alpha_u", "alpha_v", "u0", "v0"), truth.A[[0, 1, 0, 1], [0, 1, 2, 2]], strict=True))
+    turned = [
+        [
+            ((angle - right + np.pi) % (2 * np.pi) - np.pi) / view.std[name]
+            for angle, right, name in zip(
+                view.pose.euler, Pose(R, t).euler, ("R_x", "R_y", "R_z"), strict=True
+            )
+        ]
+        for view, R, t in zip(found.views.values(), truth.R, truth.t, strict=True)
+    ]
+    return [(getattr(found.intrinsics, name) - of) / found.std[name] for name, of in true.items()], np.array(
+        turned
+    )
+
+
+# 9 and 20 views, which do not contradict each other more than independent noise lets them.
+@pytest.mark.parametrize("seed", [970202, 970290])
+def test_std_count_noise_that_neighbours_share_where_the_views_do_not_show_it(seed: int) -> None:
+    assert np.abs(over_std(seed)[0]).max() < (3.0 if seed == 970202 else 5.0)
+
+
+@pytest.mark.slow
+def test_std_hold_where_neighbours_share_their_noise() -> None:
+    seeds = [
+        seed for seed in range(970300, 970400) if CONDITIONS[seed % len(CONDITIONS)] in ("clean", "narrow")
+    ]
+    camera, poses = zip(*map(over_std, seeds), strict=True)
+    assert 0.85 < np.sqrt(np.mean(np.square(camera))) < 1.05
+    assert np.abs(camera).max() < 5
+    assert np.sqrt(np.mean([(one**2).mean() for one in poses])) < 1.15
 
 
 # What is said of too few or too flat views, which is true; and of a model that the points do not tell.

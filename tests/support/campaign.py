@@ -7,7 +7,7 @@ condition that real data bring with them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,23 @@ def scene(seed: int, midpoints: bool = False) -> tuple[Correspondences, Truth]:
         made = _attempt(seed, rng, midpoints)
         if made is not None and not (midpoints and _from_both_sides(made[1])):
             return made
+
+
+def noise_of_neighbours(points: Correspondences, truth: Truth) -> Correspondences:
+    """A scene as described, with noise of which 70 % is alike over 5 to 40 % of the target."""
+    rng, of_view = np.random.default_rng([5, truth.seed]), points.view_index
+    X = (truth.R[of_view] @ points.world[..., None])[..., 0] + truth.t[of_view]
+    pixels = np.column_stack(bend(truth.model, truth.k, X[:, 0] / X[:, 2], X[:, 1] / X[:, 2]))
+    pixels = pixels * truth.A[[0, 1], [0, 1]] + truth.A[:2, 2]
+    reach = rng.uniform(0.05, 0.4)
+    for view in range(points.n_views):
+        rows = np.flatnonzero(of_view == view)
+        world = points.world[rows]
+        apart = np.linalg.norm(world[:, None] - world, axis=2) / (np.ptp(world, axis=0).max() * reach)
+        root = np.linalg.cholesky(np.exp(-0.5 * apart**2) + 1e-9 * np.eye(len(rows)))
+        shared, own = rng.normal(size=(2, len(rows), 2))
+        pixels[rows] += truth.sigma * (np.sqrt(0.7) * root @ shared + np.sqrt(0.3) * own)
+    return replace(points, pixels=pixels)
 
 
 def _from_both_sides(truth: Truth) -> bool:

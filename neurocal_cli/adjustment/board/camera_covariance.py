@@ -1,8 +1,8 @@
 """Covariance of a calibrated camera and its poses, for all code that reports or uses it.
 
 It combines the normal matrices with the uncertainty of an estimated target (`uncertainty`), the jackknife
-over views (`counting_views`), and the model uncertainty of the selected distortion model and target
-(`open_choices`).
+over views (`counting_views`) or noise that neighbours share, and the model uncertainty of the selected
+distortion model and target (`open_choices`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.adjustment.covariance import CovarianceBasis, counting_views
+from neurocal_cli.adjustment.covariance import CHANCE, CovarianceBasis, counting_views
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import translations
@@ -80,6 +80,7 @@ class CameraCovariance:
     wide: WideCovariance | None = None  # None if the model selection leaves no coefficient open
     # Probability that the print is stretched, if the given target was kept; 0 if it is negligible.
     stretched: float = 0.0
+    worth: float = 1.0  # effective number of residuals over their number, that the covariance counts
 
     @property
     def entries(self) -> Array:
@@ -105,12 +106,17 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
         assert m.repeated is not None
         few = _GROWN_OF_FEW if m.repeated.n_groups <= _FEW else np.inf
         grown = few if seen.target.bends is None else _GROWN
-    found = counting_views(plain, m, n, basis.moves_without, grown)
-    known = CameraCovariance(basis, plain, found)
+    found, worth, counted = counting_views(plain, m, n, basis.moves_without, grown), _worth(seen), 1.0
+    if m.free_poses and m.free.any():  # with a given camera, residuals are alike where it is wrong
+        found = replace(found, alone=found.alone / worth)
+        if found.shared is plain.shared:  # views that contradict each other tell more, if they are many
+            found, counted = replace(found, shared=found.shared / worth), worth
+    known = CameraCovariance(basis, plain, found, worth=counted)
     kept = seen.target_kept and m.free_poses and bool(m.free.any())
     if not np.isfinite(found.shared).all() or not (seen.choice or kept):
         return known
-    variance = _variance(seen, basis)
+    assert m.repeated is not None
+    variance = m.variance(n) / worth / m.repeated.worth
     if not variance > 0:
         return known
     known = _stretched(seen, known, variance) if kept else known
@@ -150,15 +156,19 @@ def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> Ca
     return replace(known, found=found, stretched=probability)
 
 
-def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
-    """Residual variance, enlarged for residuals correlated between neighbours or repeated poses."""
-    views, repeated = seen.minimum.views, seen.minimum.repeated
-    assert repeated is not None
-    alike = seen.alike
-    if alike is None:
-        alike = correlation(views, point_residuals(views, seen.minimum.state))
-    worth = effective_number(views.n_equations, alike) / views.n_equations * repeated.worth
-    return basis.minimum.variance(basis.n_equations) / worth
+def _worth(seen: CameraSeen) -> float:
+    """Effective number of residuals over their number, if neighbours share their noise.
+
+    The unknowns take in what varies slowly: white noise of which the slowest share q is taken out leaves
+    residuals with the correlation -sin(pi q) / (pi (1 - q)) in a row.
+    """
+    m, n = seen.minimum, seen.minimum.views.n_equations
+    alike = correlation(m.views, point_residuals(m.views, m.state)) if seen.alike is None else seen.alike
+    q = min((int(m.free.sum()) + 6 * m.views.n_views * m.free_poses) / n, 1.0)
+    alike = alike * (1.0 - q) + float(np.sin(np.pi * q)) / np.pi
+    if not alike * np.sqrt(len(m.views.index)) > CHANCE:
+        return 1.0
+    return effective_number(n, alike) / n
 
 
 def _basis(seen: CameraSeen, m: Minimum, shared: Array | None = None) -> CovarianceBasis:

@@ -73,6 +73,7 @@ class Contest:
     of_outliers: bool = False  # whether the first one explains the outliers, which are included
     remains: bool = True  # whether the points that are no outliers show it as well
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
+    worth: float = 1.0  # effective number of residuals over their number, that the reported std count
 
     @property
     def of_all_views(self) -> bool:
@@ -400,7 +401,8 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0
     )
-    by_bias = BIASED.grade(max(biased, default=0.0))
+    # Residuals that are alike because of a cause are no noise that neighbours share.
+    by_bias = BIASED.grade(max(biased, default=0.0) / contest.worth**0.5)
     return max(grade, min(by_bias, 1) if found.rival.of_distance else by_bias), reason
 
 

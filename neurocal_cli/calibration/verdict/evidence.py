@@ -135,7 +135,7 @@ class Evidence:
         self.spare = max(known.basis.n_equations - self.unknowns, 1)
         self.variance = self.cost / self.spare
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
-        self.covariance, self.wide = known.entries, known.wide
+        self.covariance, self.wide, self.worth = known.entries, known.wide, known.worth
         self.pose_covariance = known.found.own
         if calibration.given_names:
             by_camera = covariance_by_camera(self.views, self.state, self._covariance_of_given())
@@ -304,7 +304,7 @@ class Evidence:
         if held is None:
             return None
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
-        return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
+        return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)), worth=self.worth)
 
     @property
     @quietly
