@@ -1,7 +1,8 @@
 """Outlier rejection: find outlying points and whole views, leave them out, and report them.
 
 If all residuals look like normal noise, nothing is left out: good data give the same calibration to the last
-bit with and without this module. Otherwise
+bit with and without this module. If a cause that all views share explains most of the error, such as a cut
+through the image, a point is an outlier only if it is one beside that cause. Otherwise
 
 1. each view's network is trained again robustly (`consensus`); points far from it are left out, and so are
    views whose points do not agree on any network;
@@ -32,14 +33,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.adjustment.solution import Solution, restarted
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, odd_view
-from neurocal_cli.calibration.point_errors import FLOOR, PointErrors, largest_expected, point_errors, rms
+from neurocal_cli.calibration.point_errors import (
+    FLOOR,
+    PointErrors,
+    largest_expected,
+    point_errors,
+    rms,
+    whitened_errors,
+)
+from neurocal_cli.calibration.verdict.contest import contest
 from neurocal_cli.calibration.verdict.findings import MISFIT, NO_WORSE, TOLD, pixel_spread
 from neurocal_cli.calibration.verdict.mistakes import error_of_view, located, why_odd
+from neurocal_cli.calibration.verdict.rivals import ANOTHER_LENS, RICHER_LENSES
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.consensus import (
@@ -109,6 +119,9 @@ def fit_robustly(
     rough = errors.rms > _ROUGH * pixel_spread(problem.points)
     if not (contradicts or rough):
         return first, Rejected()
+    if (found := _with_common_cause(first, options)) is not None:
+        kept, solution = found
+        return solution.noted(of_all=first), _rejected(problem.points, kept, solution)
     if options.distortion == "auto" and _has_few_spare_equations(first):
         with suppress(DegenerateGeometryError):
             named = first.problem.with_model("k1") if first.state.model == "none" else first.problem
@@ -173,13 +186,43 @@ def _is_of(points: Correspondences, view: str) -> NDArray[np.bool_]:
 
 def _contradicts_noise(solution: Solution, errors: PointErrors) -> bool:
     """Whether anything in a fit is inconsistent with normal noise."""
-    points, error = solution.problem.points, errors.length
-    if not np.isfinite(error).all():
-        return True
-    everything = np.ones(len(points), dtype=bool)
-    if (error >= largest_expected(errors, everything, points)[points.view_index]).any():
+    points = solution.problem.points
+    if not _near(errors, np.ones(len(points), dtype=bool), points).all():
         return True
     return odd_view(solution) is not None
+
+
+def _with_common_cause(first: Solution, options: Options) -> tuple[_Kept, Solution] | None:
+    """The points that are no outliers beside a cause that all views share, which explains most of the error.
+
+    None without such a cause, or if more than a few points are left out. A lens that may be selected is none.
+    """
+    points, solution = first.problem.points, first
+    mask = np.ones(len(points), dtype=bool)
+    selectable = (*RICHER_LENSES, ANOTHER_LENS) if options.distortion == "auto" else ()
+    while mask.mean() > 1.0 - _LITTLE:
+        some, errors = solution.problem.points, None
+        held = contest(solution.minimum, points.image_size)
+        if held is not None and held.of_all_views and held.causes[0].rival not in selectable:
+            errors = whitened_errors(held.left * solution.problem.views.pixel_scale, some)
+        near = _near(errors or point_errors(solution, some), np.ones(len(some), dtype=bool), some)
+        if near.all():
+            if errors is None:
+                return None
+            changed = solution is not first
+            return _Kept(mask, {}), fit_again(
+                solution, some, options, only_from_here=True
+            ) if changed else first
+        mask[mask] = near
+        if len(np.unique(points.view_index[mask])) < points.n_views:
+            return None
+        solution = restarted(solution, points.select(mask))
+    return None
+
+
+def _near(errors: PointErrors, kept: NDArray[np.bool_], points: Correspondences) -> NDArray[np.bool_]:
+    """(N,) which points are nearer to their predictions than the largest error expected."""
+    return np.asarray(errors.length < largest_expected(errors, kept, points)[points.view_index])
 
 
 def _agreeing(
@@ -330,7 +373,7 @@ def _with_fitting_views(
 def _judged(points: Correspondences, kept: _Kept, solution: Solution) -> _Kept:
     """Keep the points near their predictions, in views of which these are most."""
     errors, index = point_errors(solution, points), points.view_index
-    near = errors.length < largest_expected(errors, kept.mask, points)[index]
+    near = _near(errors, kept.mask, points)
     share = np.bincount(index, near, points.n_views) / np.bincount(index)
     reasons = dict(kept.wrong_views)
     for view in np.flatnonzero(share <= _MAJORITY):

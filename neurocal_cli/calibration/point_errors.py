@@ -68,6 +68,13 @@ def point_errors(solution: Solution, points: Correspondences) -> PointErrors:
     return PointErrors(length, _parts(length, residuals, points.across))
 
 
+def whitened_errors(whitened: Array, points: Correspondences) -> PointErrors:
+    """Errors of points from residuals (N, 2) [px] that the weights of an adjustment whiten."""
+    length = np.hypot(whitened[:, 0], whitened[:, 1])
+    across = False if points.across is None else single(points.across)
+    return PointErrors(length, np.where(across, length, length * (_ONE / MEDIAN))[:, None])
+
+
 def places_of_views(solution: Solution, points: Correspondences) -> NDArray[np.intp]:
     """(N,) place of each point's view among those of a solution; -1 if it is not there."""
     place = {name: k for k, name in enumerate(solution.problem.views.names)}

@@ -70,8 +70,6 @@ class Contest:
     explained: float  # share of the squared error that all of them explain
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
     n: float  # effective number of equations beyond the unknowns
-    of_outliers: bool = False  # whether the first one explains the outliers, which are included
-    remains: bool = True  # whether the points that are no outliers show it as well
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
     worth: float = 1.0  # effective number of residuals over their number, that the reported std count
 
@@ -80,6 +78,14 @@ class Contest:
         """Whether a cause that all views share, but not the target's shape, explains most of the error."""
         first = next((one for one in self.causes[:1] if one.explained >= EXPLAINED), None)
         return first is not None and first.pattern == "all" and not first.rival.of_board
+
+    @property
+    def left(self) -> Array:
+        """(N, 2) residuals that the causes leave, normalised, in the order of the points."""
+        steps = np.zeros((self.lin.views.n_views, self.lin.width))
+        for one in self.causes:
+            steps += _steps(self.lin, one)
+        return self.lin.residuals(steps)
 
     def instead_of_target(self, worth: float = 1.0) -> float:
         """Log odds of causes other than the target's shape, known or not; 0 if there are none.
@@ -343,8 +349,6 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         if found.pattern == "all" and (found.rival.of_board or named):
             # The standard deviations do not include the board, nor a lens that was not selected.
             grade = max(grade, int(not found.rival.of_given))
-        if contest.of_outliers and not place:
-            grade = max(grade, 1)  # points are left out because of it
         if place and small and found.evidence < _UNCLEAR * LEVEL:
             continue  # it may be what a cause leaves that is too small to be told
         small = small and not grade
@@ -395,8 +399,8 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     by_poses = BIASED.grade(told.moved_poses) if moved else 0
     if by_poses:
         grade = max(grade, 1 + int(by_poses > 1 and found.explained > EXPLAINED))
-    # Outliers were left out of the calibration, and what differs from view to view is in the std.
-    if not contest.remains or not found.weights.size:
+    # What differs from view to view is in the std.
+    if not found.weights.size:
         return grade, reason
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0

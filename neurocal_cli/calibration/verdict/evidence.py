@@ -273,27 +273,11 @@ class Evidence:
     @cached_property
     @quietly
     def contest(self) -> Contest | None:
-        """The causes of the residuals; with outliers, if one that all views share explains most of them.
-
-        None where a mistake explains them.
-        """
+        """The causes of the residuals; None where a mistake explains them."""
         # Sigmas that are wrong give single points the weight that all this is computed with.
         if not self.causes or self.stated or self.mistake or self._is_exact():
             return None
-        m = self.minimum
-        kept = self._contest_at(m)
-        if self.calibration.rejected.points is None or self.calibration.target is not None:
-            return kept
-        points = with_rejected(self.calibration)
-        points = points.select(np.isin(points.view_names, self.points.view_names)[points.view_index])
-        views = arrange(points)
-        start = normalised(self.calibration.state(points.view_names), views)
-        state = adjust(views.batches, start, self.free, self.free_poses, _STEPS).state
-        held = self._contest_at(replace(m, views=views, state=state))
-        if held is None or not held.of_all_views:
-            return kept
-        remains = kept is not None and any(one.rival is held.causes[0].rival for one in kept.causes)
-        return replace(held, of_outliers=True, remains=remains)
+        return self._contest_at(self.minimum)
 
     def _contest_at(self, m: Minimum, free: NDArray[np.bool_] | None = None) -> Contest | None:
         """The contest at a minimum with these parameters free, by default those of the calibration."""

@@ -50,7 +50,7 @@ _ON_A_POINT = 0.1  # of the distance of points: as far as two places may differ 
 def odd_points(calibration: Calibration, explained: bool) -> Iterator[Finding]:
     """All findings about the points of a calibration, outliers included.
 
-    `explained` tells whether a cause or a mistake that all views share explains the outliers.
+    `explained` tells whether a mistake in all views explains the outliers.
     """
     points = with_rejected(calibration)
     yield from _rejected_points(calibration, explained)

@@ -239,9 +239,7 @@ def _is_unknown(e: Evidence) -> bool:
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    yield from odd_points(
-        calibration, e.mistake is not None or (e.contest is not None and e.contest.of_outliers)
-    )
+    yield from odd_points(calibration, e.mistake is not None)
     yield from e.noise
     if copies := repeated_views(calibration.points):
         twice = "the rows are given twice, in the view itself or in another one"
