@@ -236,7 +236,7 @@ def test_folds_and_planes_before_one_another_agree_with_brute_force(name: str) -
         scene.camera.distortion.coefficients,
     )[0].ravel()
     left, top = int(u) - 5, int(v) - 5
-    model = brute_force(scene, left, top, 11)
+    model = brute_force(scene, left, top, 11, fine=60)
     assert np.ptp(model) > 0.5
     assert np.abs(picture[top : top + 11, left : left + 11] - model).max() < 1e-3
 
