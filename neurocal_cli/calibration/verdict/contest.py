@@ -394,12 +394,11 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal, contest.std_of_poses)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
-    # Poses that rest on what is given have no other measure of their bias, nor has that of one odd view.
-    of_given = found.pattern == "all" and (found.rival.of_given or not contest.lin.free.size)
-    moved = of_given or (found.pattern == "one" and contest.lin.free_poses)
+    # Poses that rest on what is given have no other measure of their bias.
+    moved = found.pattern == "all" and (found.rival.of_given or not contest.lin.free.size)
     by_poses = BIASED.grade(told.moved_poses) if moved else 0
     if by_poses:
-        grade = max(grade, 1 + int(of_given and by_poses > 1 and found.explained > EXPLAINED))
+        grade = max(grade, 1 + int(by_poses > 1 and found.explained > EXPLAINED))
     # What differs from view to view is in the std.
     if not found.weights.size:
         return grade, reason

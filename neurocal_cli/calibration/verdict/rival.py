@@ -80,17 +80,13 @@ class Told:
 
     @property
     def moved_poses(self) -> float:
-        """Rms change of the poses in their standard deviations, of the parameter that changes most.
-
-        It is that of one view if it alone has the cause.
-        """
+        """Rms change of the poses in their standard deviations, of the parameter that changes most."""
         if self.std_of_poses is None or not (self.std_of_poses > 0).all():
             return 0.0
         lin, found = self.lin, self.found
         step = found.rival.steps_at(lin) @ found.amounts
         step[lin.free] += found.camera[: len(lin.free)]
-        views = found.weights > 0 if found.pattern == "one" else slice(None)
-        moved = (lin.solved[views, :, :-1] @ step) / self.std_of_poses[views]
+        moved = (lin.solved[:, :, :-1] @ step) / self.std_of_poses
         return float(np.sqrt((moved**2).mean(axis=0)).max())
 
     @property
