@@ -338,12 +338,10 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
         single = found.rival.patterns is None
         if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
-            told = [one for one in close if one.evidence > LEVEL and not one.rival.unknown]
+            told = [x.rival.cause for x in close if x.evidence > LEVEL and not x.rival.unknown]
             if place or not told:
                 continue
-            told.insert(0, found)
-            found = _likelier_than_not(contest, told, calibration)
-            names = dict.fromkeys(x.rival.cause for x in told if x.rival.cause != found.rival.cause)
+            names = dict.fromkeys(told)
         grade, reason = _graded(contest, found, calibration)
         named = found.rival.steps is not None and not calibration.lens_choice
         if found.pattern == "all" and (found.rival.of_board or named):
@@ -354,14 +352,6 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         small = small and not grade
         advice = (found.rival.of_selected if calibration.lens_choice else "") or found.rival.advice
         yield grade, reason + or_else(names), advice
-
-
-def _likelier_than_not(contest: Contest, told: list[Estimate], calibration: Calibration) -> Estimate:
-    """The most probable of those that are as grave as at least half of the probability says."""
-    odds = np.exp([one.evidence - told[0].evidence for one in told])
-    grades = np.array([_graded(contest, one, calibration)[0] for one in told])
-    grave = max(grade for grade in grades if odds[grades >= grade].sum() >= 0.5 * odds.sum())
-    return told[int(np.argmax(grades >= grave))]
 
 
 def given_camera(contest: Contest, calibration: Calibration) -> list[Finding]:

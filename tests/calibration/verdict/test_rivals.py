@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from support.wide_scenes import wide_set
 from support.wrong_inputs import by_rolling_shutter, of_cameras
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
-from neurocal_cli.calibration.verdict import contest as rules_of_contest
 from neurocal_cli.calibration.verdict import effects
 from neurocal_cli.calibration.verdict.contest import Contest
 from neurocal_cli.calibration.verdict.evidence import Evidence
@@ -600,20 +597,3 @@ def test_what_an_estimated_shape_has_taken_in_does_not_hide_another_cause() -> N
     assert camera.target is not None
     assert camera.verdict is not None
     assert "scaled by 1.0" in camera.verdict.reasons[0]
-
-
-@pytest.mark.parametrize(
-    ("evidence", "grades", "told"),
-    [
-        ((14.0, 13.5, 12.0), (0, 0, 1), 0),  # a tenth of the probability is that of the grave one
-        ((14.0, 13.6, 13.2), (0, 1, 2), 1),  # half of it is that of grave ones, a fifth of the gravest
-        ((14.0, 10.0, 9.0), (1, 0, 2), 0),
-    ],
-)
-def test_of_causes_that_tie_one_is_told_that_is_as_grave_as_most_of_the_probability_says(
-    monkeypatch: pytest.MonkeyPatch, evidence: tuple[float, ...], grades: tuple[int, ...], told: int
-) -> None:
-    causes: list[Any] = [SimpleNamespace(evidence=e, grade=g) for e, g in zip(evidence, grades, strict=True)]
-    monkeypatch.setattr(rules_of_contest, "_graded", lambda held, one, calibration: (one.grade, ""))
-    held: Any = None
-    assert rules_of_contest._likelier_than_not(held, causes, held) is causes[told]
