@@ -195,24 +195,29 @@ def _contradicts_noise(solution: Solution, errors: PointErrors) -> bool:
 def _with_common_cause(first: Solution, options: Options) -> tuple[_Kept, Solution] | None:
     """The points that are no outliers beside a cause that all views share, which explains most of the error.
 
-    None without such a cause, or if more than a few points are left out. A lens that may be selected is none.
+    None without such a cause, or if more than a few points are left out. A lens that is too simple displaces
+    points far beyond the linear range: if it was named, no point is an outlier because of it.
     """
     points, solution = first.problem.points, first
     mask = np.ones(len(points), dtype=bool)
-    selectable = (*RICHER_LENSES, ANOTHER_LENS) if options.distortion == "auto" else ()
     while mask.mean() > 1.0 - _LITTLE:
-        some, errors = solution.problem.points, None
-        held = contest(solution.minimum, points.image_size)
-        if held is not None and held.of_all_views and held.causes[0].rival not in selectable:
-            errors = whitened_errors(held.left * solution.problem.views.pixel_scale, some)
-        near = _near(errors or point_errors(solution, some), np.ones(len(some), dtype=bool), some)
-        if near.all():
-            if errors is None:
+        some, held = solution.problem.points, contest(solution.minimum, points.image_size)
+        common = held if held is not None and held.of_all_views else None
+        of_lens = common is not None and common.causes[0].rival in (*RICHER_LENSES, ANOTHER_LENS)
+        if of_lens and options.distortion == "auto":
+            return None
+        scale = solution.problem.views.pixel_scale
+        errors = (
+            point_errors(solution, some) if common is None else whitened_errors(common.left * scale, some)
+        )
+        near = _near(errors, np.ones(len(some), dtype=bool), some)
+        if of_lens or near.all():
+            if common is None:
                 return None
-            changed = solution is not first
+            again = solution is not first
             return _Kept(mask, {}), fit_again(
                 solution, some, options, only_from_here=True
-            ) if changed else first
+            ) if again else first
         mask[mask] = near
         if len(np.unique(points.view_index[mask])) < points.n_views:
             return None
