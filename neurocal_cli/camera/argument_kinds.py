@@ -233,6 +233,6 @@ def _words(kind: Any) -> str:
     if origin is tuple and inside[-1] is not ...:
         return f"{len(inside)} values, each {_words(inside[0])}"
     if origin is not None:
-        return f"a list, each {_words(inside[0])}"
+        return "a list" if inside[0] is Any else f"a list, each {_words(inside[0])}"
     noun = getattr(kind, "__name__", "value")
     return f"{'an' if noun[0] in 'AEIOU' else 'a'} {noun}"

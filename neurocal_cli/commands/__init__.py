@@ -7,6 +7,7 @@ at their top that needs NumPy, so that ``--help`` is fast.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -154,6 +155,8 @@ def _explain(error: Exception) -> str:
         return "the input is nested too deeply; give a file that neurocal wrote"
     if isinstance(error, UnicodeError):
         return f"a text cannot be read or written as UTF-8 ({error}); save the file as UTF-8"
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+        return "stdout cannot be written (no space left on device); free some, or give a file on another disk"
     if isinstance(error, OSError) and error.strerror:
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return f"{place}{error.strerror}"

@@ -161,6 +161,19 @@ def test_nor_is_what_is_only_printed_lost_without_a_word(made: Path, words: str)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_behind_stdout_is_told(made: Path) -> None:
+    words = [sys.executable, "-m", "neurocal_cli", "evaluate", "camera", "camera.yaml"]
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            words, stdout=full, stderr=subprocess.PIPE, cwd=made, check=False, encoding="utf-8"
+        )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(
+        "Error: stdout cannot be written (no space left on device)"
+    )
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_standard_error_does_not_cost_the_result(made: Path) -> None:
     words = [sys.executable, "-m", "neurocal_cli", "convert", "camera.yaml", "--to", "json"]
     whole = subprocess.run(words, capture_output=True, cwd=made, check=True)

@@ -108,6 +108,11 @@ def test_every_public_function_refuses_arguments_of_another_kind() -> None:
             InputError,
             "notes must be a list, each a text, not",
         ),
+        (
+            lambda: neurocal.Correspondences(np.zeros((1, 3)), np.zeros((1, 2)), "left"),
+            InputError,
+            "view must be an array or a list, not 'left'",
+        ),
         (lambda: neurocal.calibrate_rig({"a": 1}), InputError, "a dict with a Correspondences for each name"),
         (
             lambda: neurocal.calibrate(None, distortion="brown"),
