@@ -206,18 +206,17 @@ def _with_common_cause(first: Solution, options: Options) -> tuple[_Kept, Soluti
         of_lens = common is not None and common.causes[0].rival in (*RICHER_LENSES, ANOTHER_LENS)
         if of_lens and options.distortion == "auto":
             return None
-        scale = solution.problem.views.pixel_scale
-        errors = (
-            point_errors(solution, some) if common is None else whitened_errors(common.left * scale, some)
-        )
+        if common is None:
+            errors = point_errors(solution, some)
+        else:
+            errors = whitened_errors(common.left * solution.problem.views.pixel_scale, some)
         near = _near(errors, np.ones(len(some), dtype=bool), some)
         if of_lens or near.all():
             if common is None:
                 return None
-            again = solution is not first
-            return _Kept(mask, {}), fit_again(
-                solution, some, options, only_from_here=True
-            ) if again else first
+            if solution is not first:
+                solution = fit_again(solution, some, options, only_from_here=True)
+            return _Kept(mask, {}), solution
         mask[mask] = near
         if len(np.unique(points.view_index[mask])) < points.n_views:
             return None
