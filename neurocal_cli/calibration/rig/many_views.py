@@ -1,37 +1,29 @@
 """Points in space from their pixels in any number of cameras, in the first camera's frame.
 
 Each point has the smallest squared reprojection error over the cameras that saw it, each weighted by the
-noise of its pixels. It is C + B (x, y, 1) / w, where C is the centre of the first camera that saw it and the
-third column of B the ray of its pixel there. So x and y stay small wherever the ray points, w is one over the
-distance, and points at any distance up to infinity need few steps of Gauss-Newton. Halved steps do for
-damping: the iteration is not that of `adjustment.levenberg_marquardt`. If the error of a point seen by three
-cameras or more is too large, one of them may show another point: the camera without which the others agree is
-named, and left out.
+noise of its pixels (`space_points`). If the error of a point seen by three cameras or more is too large, one
+of them may show another point: the camera without which the others agree is named, and left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.space_points import BLOCK, SightedPoints, Sighting, in_noise
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 
-_MAX_STEPS, _HALVINGS = 30, 8
-_SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
-# A rise of the squared error by less, as a factor and in px^2, is rounding.
-_RISE, _ROUNDING = 1 + 1e-9, 1e-18
 _MOST_POINTS = 10**8  # whose coordinates fit into memory; a larger number is a mistake
 
 
@@ -113,152 +105,52 @@ def triangulate_many(
             "point once"
         )
     own = zip(cameras.values(), noise.tolist(), strict=True)
-    views, n = [in_noise(camera_of(one), share) for one, share in own], 1 + int(point.max(initial=-1))
-    relative = np.stack([poses[name].D for name in names])
-    whole = Sightings(views, rows, pixels / noise[rows, None], point, n, relative, rows)
+    views, relative = [in_noise(camera_of(one), share) for one, share in own], [poses[k].D for k in names]
+    place = np.full((len(names), 1 + int(point.max(initial=-1))), -1)
+    place[rows, point] = np.arange(len(point))
+    fitted = partial(_found, views, np.stack(relative), pixels / noise[rows, None])
     with np.errstate(all="ignore"):
-        return _without_contradictions(whole, _found(whole), limit)
+        return _without_contradictions(fitted(place), fitted, place, limit)
 
 
-def in_noise(camera: Camera, noise: float) -> Camera:
-    """The camera of pixels that are divided by their noise, so that a pixel of each camera counts alike."""
-    if noise == 1:
-        return camera
-    return replace(camera, intrinsics=Intrinsics.from_matrix(camera.A / [[noise], [noise], [1.0]]))
-
-
-@frozen_dataclass(eq=False)
-class Sightings:
-    """Pixels of n points in some cameras, of each of which a point has one at most."""
-
-    cameras: Sequence[Camera]
-    camera: NDArray[np.intp]  # (M,) that saw each pixel
-    pixels: Array  # (M, 2)
-    point: NDArray[np.intp]  # (M,)
-    n: int
-    poses: Array  # (P, 3, 4) [R | t] of cameras, X_camera = R X + t
-    pose: NDArray[np.intp]  # (M,) that of the camera
-
-    def only(self, rows: NDArray[np.bool_], numbers: NDArray[np.intp], n: int) -> Sightings:
-        """Some of the pixels, whose n points have these numbers."""
-        return replace(
-            self, camera=self.camera[rows], pixels=self.pixels[rows], point=numbers[self.point[rows]], n=n,
-            pose=self.pose[rows],
-        )  # fmt: skip
-
-    @cached_property
-    def rows(self) -> list[NDArray[np.intp]]:
-        """Of each camera, the rows of its pixels."""
-        return [np.flatnonzero(self.camera == k) for k in range(len(self.cameras))]
-
-    @cached_property
-    def rays(self) -> Array:
-        """(M, 3) viewing directions in the cameras' frames."""
-        rays = np.empty((len(self.point), 3))
-        for camera, mine in zip(self.cameras, self.rows, strict=True):
-            rays[mine] = camera.unproject(self.pixels[mine])
-        return rays
-
-    def compared(self, inside: Array, by: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Normal matrices (n, k + 1, k + 1), bordered by right side and cost, and which points all see.
-
-        `inside` (M, 3) are the points in the cameras' frames, and `by` (M, 3, k) their derivatives.
-        """
-        N = np.zeros((self.n, by.shape[2] + 1, by.shape[2] + 1))
-        seen = np.ones(self.n, dtype=bool)
-        for camera, mine in zip(self.cameras, self.rows, strict=True):
-            own, point = inside[mine], self.point[mine]
-            projected, fine = camera.project(own)
-            J = camera.project_jacobian(own)[1] @ by[mine] if by.size else by[mine, :2]
-            J = np.concatenate([J, (self.pixels[mine] - projected)[..., None]], axis=2)
-            N[point] += np.swapaxes(J, 1, 2) @ J
-            # A pixel's ray has one side only.
-            seen[point] &= fine & ((own * self.rays[mine]).sum(axis=1) > 0)
-        return N, seen
-
-    def fitted(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Least-squares points (n, 3), covariances (n, 6), squared errors, and which points are behind.
-
-        They are nan for points that the pixels do not determine.
-        """
-        first = np.zeros(self.n, dtype=np.intp)
-        first[self.point[::-1]] = np.arange(len(self.point))[::-1]
-        pose = self.poses[self.pose[first]]
-        back = np.swapaxes(pose[:, :, :3], 1, 2)
-        B, C = back @ _basis(self.rays[first]), -back @ pose[:, :, 3:]
-        R, t = self.poses[self.pose, :, :3], self.poses[self.pose, :, 3:]
-        by = np.concatenate([R @ B[self.point], R @ C[self.point] + t], axis=2)  # of x, y, 1 and w
-        by_q = by[:, :, [0, 1, 3]]
-        # On the first ray, at the distance whose images are nearest to the other rays.
-        across, along = (np.cross(self.rays, by[:, :, k]) for k in (2, 3))
-        both = ((along * other).sum(axis=1) for other in (across, along))
-        w = np.divide(*(np.bincount(self.point, sums, self.n) for sums in both))
-        q = np.stack([np.zeros_like(w), np.zeros_like(w), -w], axis=1)
-
-        def at(q: Array) -> tuple[Array, NDArray[np.bool_]]:
-            whole = np.column_stack([q[:, :2], np.ones(self.n), q[:, 2]])[self.point]
-            return self.compared(np.einsum("mij,mj->mi", by, whole), by_q)
-
-        N, seen = at(q)
-        for _ in range(_MAX_STEPS):
-            step = np.nan_to_num(solve_scaled(N[:, :3, :3], N[:, :3, 3:], ROUNDING)[..., 0])
-            moved = np.einsum("ni,nij,nj->n", step, np.nan_to_num(N[:, :3, :3]), step)
-            if not moved.max(initial=0.0) > _SMALL_STEP**2:
-                break
-            cost = N[:, 3, 3]
-            for _ in range(_HALVINGS):
-                trial = at(q + step)
-                worse = ~(trial[0][:, 3, 3] <= cost * _RISE + _ROUNDING) & np.isfinite(cost)
-                if not worse.any():
-                    break
-                step[worse] *= 0.5
-            else:
-                step[worse] = 0.0
-                trial = at(q + step)
-            q, (N, seen) = q + step, trial
-        x, y, w = q.T
-        along_q = np.stack([x, y, np.ones_like(w)], axis=1)[..., None] / w[:, None, None]
-        moved_by = B @ (np.eye(3) * [1, 1, 0] - along_q * [0, 0, 1]) / w[:, None, None]
-        points = (C + B @ along_q)[..., 0]
-        inverse = moved_by @ solve_scaled(N[:, :3, :3], np.swapaxes(moved_by, 1, 2), ROUNDING)
-        a, b = np.triu_indices(3)
-        covariance, cost = inverse[:, a, b], N[:, 3, 3]
-        lost = ~np.isfinite(points).all(axis=1) | ~np.isfinite(covariance).all(axis=1)
-        lost |= np.bincount(self.point, minlength=self.n) < 2
-        points[lost], covariance[lost], cost[lost] = np.nan, np.nan, np.nan
-        return points, covariance, cost, lost | ~seen | ~(w > 0)
-
-
-def _basis(rays: Array) -> Array:
-    """(n, 3, 3) right-handed unit vectors, the third of which is the ray."""
-    # The coordinate axis that is most across the ray.
-    first = np.cross(np.eye(3)[np.argmin(np.abs(rays), axis=1)], rays)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(rays, first), rays], axis=2)
-
-
-def _found(seen: Sightings) -> SpacePoints:
-    points, covariance, cost, behind = seen.fitted()
-    count = np.bincount(seen.point, minlength=seen.n)
+def _found(cameras: Sequence[Camera], poses: Array, pixels: Array, rows: NDArray[np.intp]) -> SpacePoints:
+    """Points from the pixels (M, 2) of cameras at poses (C, 3, 4); `rows` (C, n) are theirs, or -1."""
+    C, n = rows.shape
+    points, covariance, cost = np.full((n, 3), np.nan), np.full((n, 6), np.nan), np.full(n, np.nan)
+    count, behind, which = (rows >= 0).sum(axis=0), np.ones(n, dtype=bool), (rows >= 0).argmax(axis=0)
+    for first in range(C):
+        its = np.flatnonzero((which == first) & (count > 1))
+        for block in np.split(its, range(BLOCK, len(its), BLOCK)) if its.size else ():
+            seen = []
+            for camera, pose, own in zip(cameras[first:], poses[first:], rows[first:, block], strict=True):
+                at = np.flatnonzero(own >= 0)
+                if at.size:
+                    which_points = slice(None) if len(at) == len(block) else at
+                    seen.append(Sighting(camera, pose[:, :, None], pixels[own[at]], which_points))
+            found = SightedPoints(len(block), seen).fitted()
+            points[block], covariance[block], cost[block], behind[block] = found
     error = np.sqrt(cost / np.maximum(2 * count - 3, 1))
-    return SpacePoints(points, covariance, error, count, np.full(seen.n, -1), behind)
+    return SpacePoints(points, covariance, error, count, np.full(n, -1), behind)
 
 
-def _without_contradictions(whole: Sightings, found: SpacePoints, limit: float) -> SpacePoints:
+def _without_contradictions(
+    found: SpacePoints,
+    fitted: Callable[[NDArray[np.intp]], SpacePoints],
+    rows: NDArray[np.intp],
+    limit: float,
+) -> SpacePoints:
     """Leave out the one camera without which the others agree, where a point's error exceeds the limit."""
     wrong = (found.n_cameras >= 3) & ~(found.error <= limit)
     if not wrong.any() or not np.isfinite(limit):
         return found
     best = found
-    for k in range(len(whole.cameras)):
-        has = np.zeros(whole.n, dtype=bool)
-        has[whole.point[whole.camera == k]] = True
-        some = wrong & has
-        if not some.any():
+    for k, own in enumerate(rows):
+        places = np.flatnonzero(wrong & (own >= 0))
+        if not places.size:
             continue
-        rows = some[whole.point] & (whole.camera != k)
-        part = _found(whole.only(rows, np.cumsum(some) - 1, int(some.sum())))
-        places = np.flatnonzero(some)
+        others = rows[:, places]
+        others[k] = -1
+        part = fitted(others)
         better = (part.error <= limit) & ~part.behind & ~(part.error >= best.error[places])
         kept = places[better]
         changes = {}

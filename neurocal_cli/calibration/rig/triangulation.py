@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.many_views import Sightings, in_noise
 from neurocal_cli.calibration.rig.rig import StereoRig
-from neurocal_cli.calibration.rig.two_view_points import PointBatch
+from neurocal_cli.calibration.rig.space_points import BLOCK, SightedPoints, Sighting, in_noise
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
@@ -30,8 +29,8 @@ from neurocal_cli.errors import InputError
 Method = Literal["optimal", "linear", "midpoint"]
 METHODS = get_args(Method)
 
-_BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
-_FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
+_LEAST_DEPTH = 0.17  # of a ray at 80 degrees: image equations of rays farther from the axis mean little
+_AT_THE_ORIGIN = np.eye(3, 4)[:, :, None]  # the pose of the left camera
 _FEWEST_ERRORS, _NOTICED, _CERTAIN = 10, 1.5, 5.0  # points; times the noise; standard deviations
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 
@@ -153,73 +152,52 @@ def triangulate(
         which = None
     elif which is None or len(which) != n:
         raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
-    wide = any(_sees_sideways(camera, seen) for camera, seen in zip(cameras, pixels, strict=True))
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
     covariance = np.empty((n, 6)) if method == "optimal" else None
     with np.errstate(all="ignore"):
-        for start in range(0, n, _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            left_seen, right_seen = pixels[0][rows], pixels[1][rows]
+        for start in range(0, n, BLOCK):
+            rows = slice(start, start + BLOCK)
             rig = np.moveaxis(rigs if which is None else rigs[which[rows]], 0, -1)
-            if covariance is not None and not wide:
-                batch = PointBatch(cameras, rig, left_seen.T, right_seen.T)
-                points[rows], covariance[rows], epipolar[rows], behind[rows] = batch.optimal()
-                continue
-            seen = _sightings(cameras, rig, left_seen, right_seen)
+            seen = [
+                Sighting(camera, pose, own[rows], slice(None))
+                for camera, pose, own in zip(cameras, (_AT_THE_ORIGIN, rig), pixels, strict=True)
+            ]
             if covariance is not None:
-                points[rows], covariance[rows], cost, behind[rows] = seen.fitted()
+                found = SightedPoints(len(seen[0].pixels), seen).fitted()
+                points[rows], covariance[rows], cost, behind[rows] = found
             else:
-                points[rows] = _midpoint(seen) if method == "midpoint" else _linear(seen, wide)
-                whole = np.column_stack([points[rows], np.ones(seen.n)])[seen.point]
-                inside = (seen.poses[seen.pose] @ whole[..., None])[..., 0]
-                N, in_front = seen.compared(inside, np.zeros((len(inside), 3, 0)))
-                cost, behind[rows] = N[:, 0, 0], ~in_front
+                points[rows] = (_midpoint if method == "midpoint" else _linear)(*seen)
+                (cost, fine), (other, both) = (one.misses(points[rows]) for one in seen)
+                cost, behind[rows] = cost + other, ~(fine & both)
             epipolar[rows] = np.sqrt(cost)
     return Triangulated(points, covariance, epipolar, behind)
 
 
-def _sightings(cameras: tuple[Camera, Camera], rig: Array, left: Array, right: Array) -> Sightings:
-    """The pixels of both cameras; the rig (3, 4, n or 1) is as for `PointBatch`."""
-    n, m = len(left), rig.shape[2]
-    pose = np.append(np.zeros(n, dtype=np.intp), 1 + np.arange(n) % m)
-    poses = np.concatenate([np.eye(3, 4)[None], np.moveaxis(rig, -1, 0)])
-    side, pixels = np.repeat([0, 1], n), np.concatenate([left, right])
-    return Sightings(cameras, side, pixels, np.tile(np.arange(n), 2), n, poses, pose)
-
-
-def _midpoint(seen: Sightings) -> Array:
+def _midpoint(left: Sighting, right: Sighting) -> Array:
     """(n, 3) the points with the smallest sum of squared distances from both rays."""
-    R, t = seen.poses[seen.pose, :, :3], seen.poses[seen.pose, :, 3:]
-    back = np.swapaxes(R, 1, 2)
-    (left, right), (first, second) = (
-        np.split(a[..., 0], 2) for a in (back @ seen.rays[..., None], -back @ t)
-    )
-    n = np.cross(left, right)
+    back = np.swapaxes(right.pose[:, :3], 0, 1)
+    first, second = left.rays.T, np.einsum("ijn,jn->ni", back, right.rays)
+    centre = -np.einsum("ijn,jn->ni", back, right.pose[:, 3])
+    n = np.cross(first, second)
     # To the feet of the common perpendicular, times the square of the sine between the rays.
-    s, u = ((np.cross(second - first, ray) * n).sum(axis=1, keepdims=True) for ray in (right, left))
-    return np.asarray(0.5 * (first + second + (s * left + u * right) / (n * n).sum(axis=1, keepdims=True)))
+    s, u = ((np.cross(centre, ray) * n).sum(axis=1, keepdims=True) for ray in (second, first))
+    return np.asarray(0.5 * (centre + (s * first + u * second) / (n * n).sum(axis=1, keepdims=True)))
 
 
-def _linear(seen: Sightings, wide: bool) -> Array:
+def _linear(*seen: Sighting) -> Array:
     """(n, 3) smallest singular vectors of the image equations, or of rays along their points."""
-    rows = cross_matrix(seen.rays) if wide else cross_matrix(seen.rays / seen.rays[:, 2:])[:, :2]
-    equations = np.concatenate(np.split(rows @ seen.poses[seen.pose], 2), axis=1)
+    wide = any((one.rays[2] < _LEAST_DEPTH).any() for one in seen)
+    rays = [one.rays.T for one in seen]
+    rows = [cross_matrix(own) if wide else cross_matrix(own / own[:, 2:])[:, :2] for own in rays]
+    equations = np.concatenate(
+        [own @ np.moveaxis(one.pose, -1, 0) for own, one in zip(rows, seen, strict=True)], axis=1
+    )
     nowhere = ~np.isfinite(equations).all(axis=(1, 2))
     equations[nowhere] = np.eye(equations.shape[1], 4)
     last = np.linalg.svd(equations)[2][:, 3]
     points = last[:, :3] / last[:, 3:]
     points[nowhere] = np.nan
     return np.asarray(points)
-
-
-def _sees_sideways(camera: Camera, pixels: Array) -> bool:
-    """Whether any ray is too far from the axis for the faster parametrisation (x, y, 1) / w."""
-    if not camera.distortion.wide or not len(pixels):
-        return False
-    # Only pixels farthest from the principal point need a test; several, because of tangential terms.
-    away = np.nan_to_num(np.hypot(*(pixels - camera.A[:2, 2]).T))
-    farthest = np.argsort(-away, kind="stable")[:_FARTHEST]
-    return not bool((camera.unproject(pixels[farthest])[:, 2] > _LEAST_DEPTH).all())
 
 
 def epipolar_limit(sigma: float) -> float:
