@@ -20,8 +20,10 @@ def main() -> None:
     # time on 1000 views; looking once more at the exit, through every module, took 25 ms of any command.
     gc.set_threshold(300_000, 20, 20)
     atexit.register(gc.freeze)
-    # Ended as if interrupted: what is half written is cleared away.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    # Ended as if interrupted: what is half written is cleared away. `nohup` ignores the end of the terminal.
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):  # not on Windows
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:
         from neurocal_cli.commands import neurocal
         from neurocal_cli.commands.streams import stand_in_for_closed_stdout

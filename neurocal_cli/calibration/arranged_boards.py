@@ -62,30 +62,37 @@ def arranged(
     told : tuple of str
         What the boards are to each other.
     """
-    apart = in_one_space(points)
+    apart, shifts = in_one_space(points)
     alone = {name: replace(one, image=None) for name, one in apart.items()}
     free = fitted(alone, target)
     boards = dict.fromkeys(board for one in points.values() for board in boards_of(one).tolist())
     found = _arrangement(apart, cameras(free), list(boards))
+    moved = {
+        name: f"{shift[0]:.9g} is added to X of board {name}, also in its poses: no two boards have one place"
+        for name, shift in shifts.items()
+        if shift[0]
+    }
     if len(found.poses) < 2:
-        return free, ()
+        return free, tuple(moved.values())
     told = f"boards {name_some(found.poses)}"
     joined = on_arrangement(apart, {name: (pose.R, pose.t) for name, pose in found.poses.items()})
     try:
         as_one = {name: replace(one, image=None) for name, one in joined.items()}
         fixed = fitted(as_one, "free" if target == "auto" else target)
     except NeurocalError:
-        return free, ()
+        return free, tuple(moved.values())
     ratio = _noise(cameras(fixed)) / _noise(cameras(free))
     if ratio > _LOOSE:
         return free, (
             f"{told} are not quite fixed to each other: the error is {ratio:.3g} times as large if they are; "
             "each has poses of its own",
+            *moved.values(),
         )
     first = next(iter(found.poses))
     return fixed, (
         f"{told} are fixed to each other, as {plural(found.agreed, 'image')} show; X, Y, Z are those of "
         f"board {first}",
+        *(text for name, text in moved.items() if name not in found.poses),
     )
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from neurocal_cli.commands.boards import with_other_kind
 from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line, say
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, plural
+from neurocal_cli.files.image_files import view_names
 from neurocal_cli.files.writing import write_at_once
 
 if TYPE_CHECKING:
@@ -125,13 +126,20 @@ def watch_for_images(
 
     outcomes: dict[str, Outcome] = {}
     waiting: list[str] = []  # for the size of the board
+    refused: set[str] = set()  # for their names
     sizes: dict[str, tuple[int, float]] = {}
     last = time.monotonic()
     try:
         while time.monotonic() - last < seconds:
-            for path in _whole(find, sizes, {*outcomes, *waiting}):
-                waiting.append(path)
+            for path in _whole(find, sizes, {*outcomes, *waiting, *refused}):
                 last = time.monotonic()
+                try:
+                    view_names([*outcomes, *waiting, path])
+                except InputError as error:
+                    complain(f"{error}; it is left out")
+                    refused.add(path)
+                    continue
+                waiting.append(path)
                 try:
                     options = prepare(waiting)
                 except NoBoardError as error:

@@ -131,11 +131,13 @@ def agreed_size(seen: Sequence[SeenBoard]) -> FoundBoard:
     if 2 * len(several) > len(seen):
         sizes, _ = Counter(tuple(sorted((one.size, *one.beside))) for one in several).most_common(1)[0]
         alike = len(sizes) == 2 and sizes[0] == sizes[1]
-        halves = "cut pictures that hold both images of a stereo camera apart, " if alike else ""
+        advice = "cut pictures that hold both images of a stereo camera apart, " if alike else ""
+        if len(set(sizes)) == len(sizes):
+            advice = "measure each by itself, by --cols, --rows and --board-name, "
         raise NoBoardError(
             f"the images show {len(sizes)} chessboards beside each other, of {size_names(sizes)} inner "
-            f"vertices; {halves}describe them in a board file and give it with --board, or show only one of "
-            "them"
+            f"vertices; {advice}describe them as planes of a board file if they are fixed to each other, or "
+            "show only one of them"
         )
     sure = Counter(one.size for one in seen if one.vote == Vote.SURE)
     enough = _with_enough_votes(seen, Vote.WHOLE) or _with_enough_votes(seen, Vote.PART)

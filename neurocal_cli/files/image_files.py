@@ -98,9 +98,15 @@ def natural_order(name: str) -> list[tuple[int, str, int]]:
 
 
 def view_names(paths: Iterable[str]) -> tuple[str, ...]:
-    """Name a view after each file, without folder and extension; InputError if two have the same name."""
+    """Name a view after each file, without folder and extension.
+
+    Raises InputError if two have the same name, or a name has a line break, which no table can hold.
+    """
     files = tuple(paths)
     names = tuple("stdin" if path == "-" else Path(path).stem for path in files)
+    broken = next((path for path, name in zip(files, names, strict=True) if re.search(r"[\r\n]", name)), None)
+    if broken is not None:
+        raise InputError(f"{one_line(broken)} has a line break in its name; rename it")
     doubled = next((name for name, count in Counter(names).items() if count > 1), None)
     if doubled is not None:
         first, second, *_ = (

@@ -252,7 +252,7 @@ def _undisturbed() -> Iterator[None]:
     former = {}
     try:
         with suppress(ValueError):  # in a thread, which interrupts do not reach
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
                 former[number] = signal.signal(number, signal.SIG_IGN)
         yield
     finally:

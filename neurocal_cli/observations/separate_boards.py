@@ -6,7 +6,7 @@ so that boards may have points with the same ids and the same X, Y, Z.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -51,6 +51,16 @@ def boards_of(points: Correspondences) -> NDArray[np.str_]:
     return np.array([name.rpartition(":")[2] for name in points.view_names])[points.view_index]
 
 
+def of_each_board(points: Correspondences) -> Iterator[Correspondences]:
+    """The points of each board that `by_board` told apart; all points if it did not."""
+    boards = boards_of(points)
+    ids = np.full(len(points), "") if points.point is None else np.asarray(points.point).astype(str)
+    if not np.char.startswith(ids, np.char.add(boards, "/")).all():
+        boards[:] = ""
+    for board in np.unique(boards):
+        yield points.select(boards == board)
+
+
 def parts_of(points: Correspondences) -> tuple[list[str] | None, list[str] | None, list[str] | None]:
     """Views, boards and ids of all rows as they were before `by_board`."""
     view = None if points.view is None else np.array(points.view_names)[points.view_index].tolist()
@@ -62,8 +72,13 @@ def parts_of(points: Correspondences) -> tuple[list[str] | None, list[str] | Non
     return np.asarray(points.image).astype(str).tolist(), board, ids
 
 
-def in_one_space(points: Mapping[str, Correspondences]) -> dict[str, Correspondences]:
-    """The points of all cameras, by name, with boards beside each other along X where they overlap."""
+def in_one_space(
+    points: Mapping[str, Correspondences],
+) -> tuple[dict[str, Correspondences], dict[str, Array]]:
+    """The points of all cameras, by name, with boards beside each other along X where they overlap.
+
+    The second result is the shift (3,) of each board.
+    """
     boards = {name: boards_of(one) for name, one in points.items()}
     shift = _shifts(
         {
@@ -74,7 +89,7 @@ def in_one_space(points: Mapping[str, Correspondences]) -> dict[str, Corresponde
     return {
         name: replace(one, world=one.world + np.array([shift[board] for board in boards[name].tolist()]))
         for name, one in points.items()
-    }
+    }, shift
 
 
 def _shifts(places: Mapping[str, Array]) -> dict[str, Array]:

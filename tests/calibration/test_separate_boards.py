@@ -13,6 +13,7 @@ from neurocal_cli import Pose, calibrate, read_points, write_points
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
 from neurocal_cli.camera.geometry import Array, nearest_similarity, rotation_step
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.observations.separate_boards import boards_of
 from neurocal_cli.simulation.rigs import SimulatedRig, random_rig
 
 BESIDE = Pose(rotation_step(np.array([0.1, 0.6, 0.2])), np.array([520.0, 40.0, 60.0]))
@@ -36,6 +37,34 @@ def test_boards_with_poses_of_their_own_are_views_of_their_own() -> None:
     assert rms(errors_over_std(rig, truth)) < 2
     assert {name.rpartition(":")[2] for name in rig.cameras["cam0"].views} == {"A", "B"}
     assert not any("fixed to each other" in warning for warning in rig.warnings)
+
+
+def test_boards_may_have_squares_of_different_sizes() -> None:
+    truth, points = seen(None, n=1)
+    one = points["cam0"]
+    of_b = boards_of(one) == "B"
+    one = replace(one, world=np.where(of_b[:, None], 1.2 * one.world, one.world))
+    found = calibrate(one, skew=False, distortion="k1k2", target="given")
+    assert found.verdict is not None
+    assert not any("than in the other views" in reason for reason in found.verdict.reasons)
+    # The second board has another place, where the points of the two would be one; the first one does not.
+    (told,) = [warning for warning in found.warnings if "is added to X of board B" in warning]
+    shift = np.array([float(told.split()[0]), 0.0, 0.0])
+    camera, held = truth.mounted["cam0"], list(truth.frames.values())
+    for name, view in found.views.items():
+        image, _, board = name.partition(":")
+        of_second = float(board == "B")
+        pose = held[(list(truth.frames).index(image) + round(of_second) * len(held) // 2) % len(held)]
+        true = (camera.R @ pose.t + camera.t) * (1 + 0.2 * of_second)
+        assert np.linalg.norm(view.pose.t + view.pose.R @ shift * of_second - true) < 0.01 * np.linalg.norm(
+            true
+        )
+    # A unit of some views of one board is told as before.
+    first = one.view_index == one.view_index[0]
+    mixed = replace(one, world=np.where(first[:, None], one.world / 25.4, one.world))
+    verdict = calibrate(mixed, skew=False, distortion="k1k2", target="given").verdict
+    assert verdict is not None
+    assert any("25.4 times closer together" in reason for reason in verdict.reasons)
 
 
 def test_cameras_that_see_no_board_together_are_tied_by_boards_that_are_fixed_to_each_other() -> None:

@@ -212,6 +212,25 @@ def test_the_watch_goes_on_past_as_many_images_of_another_size(tmp_path: Path) -
     assert "2 of 3 images" in result.stderr
 
 
+def test_the_watch_goes_on_past_names_that_cannot_be_those_of_views(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name in ("board01.png", "board01.PNG", "a\nb.png"):
+        (folder / name).write_bytes((SAMPLES / "board01.png").read_bytes())
+    points = tmp_path / "points.csv"
+    result = run("detect", folder, *BOARD, "--watch", 0.5, "-o", points)
+    assert result.exit_code == 0, result.stderr
+    assert "would both be the view 'board01'; rename one of them; it is left out" in result.stderr
+    assert "b.png has a line break in its name; rename it; it is left out" in result.stderr
+    assert "1 of 1 images" in result.stderr
+    points.unlink()
+    (folder / "board01.PNG").unlink()
+    result = run("detect", folder, *BOARD, "-o", points)
+    assert result.exit_code == 1
+    assert "board detected" not in result.stderr  # told before the images are examined
+    assert not points.exists()
+
+
 def test_an_interrupt_ends_the_watch_and_the_points_are_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

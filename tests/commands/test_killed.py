@@ -11,6 +11,8 @@ import pytest
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
+_HANGUP = getattr(signal, "SIGHUP", signal.SIGTERM)  # the terminal is closed; not on Windows
+
 
 def descendants(pid: int) -> set[int]:
     """Processes that a process has started, and those that these have."""
@@ -83,8 +85,10 @@ def test_an_interrupt_while_workers_start_is_told_in_one_line(tmp_path: Path) ->
         ("raise KeyboardInterrupt", 130, "Error: interrupted\n"),
         ("eval('[signal.raise_signal(signal.SIGINT) for _ in range(9)]')", 130, "Error: interrupted\n"),
         ("atexit.register(signal.raise_signal, signal.SIGINT)", 0, ""),
+        ("signal.raise_signal(signal.SIGTERM)", 143, ""),
+        ("signal.raise_signal(getattr(signal, 'SIGHUP', signal.SIGTERM))", 128 + _HANGUP, ""),
     ],
-    ids=["while modules are loaded", "while a module evaluates a text", "while Python ends"],
+    ids=["while modules are loaded", "while a module evaluates a text", "while Python ends", "end", "hangup"],
 )
 def test_an_interrupt_is_no_death_by_signal(command: str, code: int, told: str) -> None:
     lines = (

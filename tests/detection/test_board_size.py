@@ -73,6 +73,10 @@ def test_the_largest_size_with_enough_votes_is_the_boards(
             "the images show 3 chessboards beside each other, of 7 x 6, 8 x 6 and 8 x 6 inner vertices",
         ),
         (
+            [SeenBoard((9, 6), WHOLE, ((5, 4),))] * 3,
+            "of 5 x 4 and 9 x 6 inner vertices; measure each by itself, by --cols, --rows and --board-name",
+        ),
+        (
             [SeenBoard((9, 6), WHOLE, ((9, 6),))] * 3,
             "of 9 x 6 and 9 x 6 inner vertices; cut pictures that hold both images of a stereo camera apart",
         ),

@@ -25,6 +25,7 @@ from neurocal_cli.calibration.verdict.findings import (
 from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.separate_boards import of_each_board
 
 _NAME_IMAGES = "give each image a name of its own as its view"
 _BESIDE = 1.0  # px by which a detected point may lie outside the image
@@ -197,7 +198,12 @@ def repeated_views(points: Correspondences) -> tuple[str, ...]:
 
 
 def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
-    """Findings about views in which the points are spaced wider or closer than in most views."""
+    """Findings about views in which the points are spaced wider or closer than in most of their board."""
+    for own in of_each_board(points):
+        yield from _of_another_scale(own)
+
+
+def _of_another_scale(points: Correspondences) -> Iterator[Finding]:
     worlds = worlds_by_view(points)
     step, error = _steps(worlds).T
     log = np.log(step)
