@@ -140,15 +140,13 @@ def _path(points: Array, closed: bool = False) -> str:
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
     """Draw all panels of a camera, or one of `CAMERA_PANELS`; the same subject gives the same bytes."""
-    panels = panels_of(subject)
-    if panel is not None:
-        return _alone(panel, panels[panel], kind)
     evaluation = subject.evaluation
     title = (
         f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
         f"{evaluation.n_points} points, {plural(len(evaluation.views), 'view')}"
     )
-    return _page([list(row) for row in _ROWS], (1, 1, 1, 0.6), panels, title, _PAGE, kind)
+    rows = [list(row) for row in _ROWS]
+    return _page(rows, (1, 1, 1, 0.6), panels_of(subject), title, _PAGE, kind, panel)
 
 
 def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> bytes:
@@ -160,21 +158,19 @@ def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> 
         for name, draw in panels_of(subject).items()
     }
     panels["poses"] = lambda axes: draw_poses(axes, rig.left, [(rig.right.camera, rig.pose)], _SIDES)
-    if panel == "poses":
-        return _alone(panel, panels[panel], kind)
     rows = [
         [f"{side} {name}" for side in sides] for name in ("residuals", "uncertainty", "coverage", "views")
     ]
     rows.append(["poses"] * 2)
     size = _PAGE[0], 1.25 * _PAGE[1]
-    if panel is not None:
-        rows = [[f"{side} {panel}" for side in sides]]
+    if panel not in (None, "poses"):
+        rows, panel = [[f"{side} {panel}" for side in sides]], None
         size = 2 * _PANEL[0], _PANEL[1]
     title = (
         f"rms {rig.rmse_px:.4g} px, max {rig.max_px:.4g} px, {len(rig.pairs)} pairs of views, baseline "
         f"{rig.baseline:.6g} {plain(rig.unit)}"
     )
-    return _page(rows, (1,) * len(rows), panels, title, size, kind)
+    return _page(rows, (1,) * len(rows), panels, title, size, kind, panel)
 
 
 def draw_rig(rig: Rig, kind: str = "png") -> bytes:
@@ -216,14 +212,12 @@ def draw_points_in_space(
         "views": lambda axes: _draw_space_views(axes, evaluation, unit),
         "poses": lambda axes: draw_poses(axes, None if rig is None else rig.left, others, names),
     }
-    if panel is not None:
-        return _alone(panel, panels[panel], kind)
     rows = [["across", "depth"], ["depths", "poses"], ["views"] * 2]
     title = (
         f"{found.n_points} triangulated points: rms {found.rmse:.4g} {unit}, NSCE {found.nsce:.3g}, "
         f"epipolar rms {found.epipolar_px:.3g} px"
     )
-    return _page(rows, (1, 1, 0.8), panels, title, (_PAGE[0], 0.8 * _PAGE[1]), kind)
+    return _page(rows, (1, 1, 0.8), panels, title, (_PAGE[0], 0.8 * _PAGE[1]), kind, panel)
 
 
 def _page(
@@ -233,8 +227,11 @@ def _page(
     title: str,
     size: tuple[float, float],
     kind: str,
+    panel: str | None = None,
 ) -> bytes:
-    """Draw rows of panels on one page."""
+    """Draw rows of panels on one page, or a single panel."""
+    if panel is not None:
+        rows, heights, title, size = [[panel]], (1,), "", _PANEL
     with drawing(size, _PAD, kind) as (figure, file):
         axes = figure.subplot_mosaic(
             rows,  # type: ignore[arg-type]
@@ -244,14 +241,6 @@ def _page(
         for name, place in axes.items():
             panels[name](place)
         figure.suptitle(title)
-    return file.getvalue()
-
-
-def _alone(name: str, draw: Draw, kind: str) -> bytes:
-    """Draw a single panel."""
-    how = {"projection": "3d"} if name == "poses" else {}
-    with drawing(_PANEL, _PAD, kind) as (figure, file):
-        draw(figure.add_subplot(**how))
     return file.getvalue()
 
 
