@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,13 +50,11 @@ def write_result(
     ending = os.path.splitext(str(path))[1].lower()
     # Modules of other formats are imported only if they are needed.
     if ending == ".xml":
-        from neurocal_cli.files.exchange.adaptation import adapt_cameras
-        from neurocal_cli.files.exchange.dictionary import OPENCV
-        from neurocal_cli.files.exchange.neurocal import camera_set
+        from neurocal_cli.files.exchange.reading import converted
 
-        adapted = adapt_cameras(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
-        write_whole(path, OPENCV.text(adapted.cameras, ending)[""])
-        return (*adapted.losses, *adapted.remarks)
+        found = converted(result, "opencv", None, force=False, ending=ending)
+        write_whole(path, found.files[""])
+        return (*found.warnings, *found.remarks)
     by_rows = ending == ".json"  # JSON loads fast at any length
     if isinstance(result, Calibration):
         text = format_calibration(result, by_rows)
