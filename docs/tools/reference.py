@@ -148,7 +148,7 @@ def _formats_page() -> str:
             one.files,
             f"`{one.to}`" if one.is_written else "read only",
             "any number" if one.most_cameras > 2 else str(one.most_cameras),
-            (one.rig or "no") + (", in metres" if one.rig and one.metres else ""),
+            (one.rig or "no") + (", in metres" if one.rig and one.unit == "m" else ""),
             "yes" if one.poses else "no",
             "yes" if one.holds_skew else "no",
             pixels[one.first_pixel],

@@ -103,8 +103,8 @@ def test_a_rig_comes_back_from_each_format_as_it_was(target: str, tmp_path: Path
     found = read_back(written(given, target, tmp_path))
     for one, other in zip(found.cameras, given.cameras, strict=True):
         same(one, other)
-    same_pose(found.relative[0], RIGHT, 1e-3 if FORMATS[target].metres else 1.0)
-    if FORMATS[target].metres:
+    same_pose(found.relative[0], RIGHT, 1e-3 if FORMATS[target].unit == "m" else 1.0)
+    if FORMATS[target].unit == "m":
         assert found.unit == "m"
 
 

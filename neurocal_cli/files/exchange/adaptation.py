@@ -52,7 +52,7 @@ def adapt_cameras(
     # ROS and mrcal write the pose of a camera in its own frame, which tells nothing.
     poses = () if target.poses else cameras.poses.values()
     n_views = sum(not np.array_equal(pose.D, np.eye(3, 4)) for pose in poses)
-    if target.metres:
+    if target.unit == "m":
         cameras = (cameras if target.poses else replace(cameras, poses={})).in_metres()
     if model is not None and model not in target.models:
         held = ", ".join(target.models)

@@ -88,7 +88,7 @@ KALIBR = Format(
     pose=_kalibr_poses,
     write=yaml_text,
     whole=_camchain,
-    metres=True,
+    unit="m",
     needs_size=True,
     rig="`T_cn_cnm1` from the camera before; `T_cam_imu`; `T_imu_cam` into the IMU",
 )
@@ -163,7 +163,7 @@ MULTICAL = Format(
     files="calibration.json",
     parts=_multical_parts,
     pose=_A_TO_B,
-    metres=True,
+    unit="m",
     rig="`camera_poses`, `a_to_b` from b to a",
 )
 

@@ -84,7 +84,7 @@ CALISCOPE = Format(
         for k, tree in enumerate(trees)
     },
     has_skew=True,
-    metres=True,
+    unit="m",
     needs_size=True,
     rig="`rotation, translation` [m] from the world to each camera",
 )
@@ -98,7 +98,7 @@ ANIPOSE = replace(
     whole=lambda trees, cameras: (
         {f"cam_{k}": tree for k, tree in enumerate(trees)} | {"metadata": {"adjusted": False}}
     ),
-    metres=False,
+    unit=None,
     rig="`rotation, translation` from the world to each camera",
 )
 
@@ -134,7 +134,7 @@ EASYMOCAP = Format(
     files="intri.yml and extri.yml",
     parts=_easymocap_parts,
     pose=PoseKeys("Rot T", frame="world"),
-    metres=True,
+    unit="m",
     rig="`Rot_`, `T_` from the world to each camera",
 )
 

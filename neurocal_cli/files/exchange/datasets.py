@@ -42,7 +42,7 @@ KITTI = Format(
     files="calib_cam_to_cam.txt; calib.txt of the odometry",
     parts=_kitti_parts,
     pose=PoseKeys("R T"),
-    metres=True,
+    unit="m",
     rig="`R_`, `T_` from camera 0; `P0` to `P3`",
 )
 
@@ -68,7 +68,7 @@ ARGOVERSE = Format(
     files="vehicle_calibration_info.json of Argoverse 1",
     parts=_argoverse_parts,
     pose=PoseKeys(_IN_VEHICLE, back=True, needed=True),
-    metres=True,
+    unit="m",
     rig="`vehicle_SE3_camera_` from each camera to the vehicle",
 )
 
@@ -82,7 +82,7 @@ ZOD = Format(
     files="calibration.json of the Zenseact Open Dataset",
     parts=lambda document: {"FC": document.root["FC"]},
     pose=PoseKeys("extrinsics", back=True, frame="vehicle"),
-    metres=True,
+    unit="m",
 )
 
 
@@ -111,7 +111,7 @@ NUSCENES = Format(
     files="calibrated_sensor.json of nuScenes, with the sensors of one recording",
     parts=_nuscenes_parts,
     pose=PoseKeys("rotation translation", back=True, needed=True, frame="vehicle"),
-    metres=True,
+    unit="m",
     rig="`rotation, translation` from each camera to the vehicle",
 )
 

@@ -246,7 +246,6 @@ class Format(CameraKeys):
     has_skew: bool = False  # whether its programs support skew, if no key tells it
     poses: bool = False  # whether it contains the poses of views
     at_most: int | None = None  # cameras: if it is not told, one, or any number of a rig
-    metres: bool = False  # whether lengths are in metres
     needs_size: bool = False  # whether the image size must be known
     rectified: bool = False  # whether it contains the rectification of a camera
     square: bool = False  # whether its pixels are square
@@ -325,8 +324,7 @@ class Format(CameraKeys):
             views = {getattr(self.pose, "frame", "body"): pose for pose in known}
         elif len(known) == len(cameras):
             relative = tuple(after(pose, inverse(known[0])) for pose in known[1:])
-        unit = "m" if self.metres else self.unit
-        unit = unit(first) if callable(unit) else unit if poses else None
+        unit = self.unit(first) if callable(self.unit) else self.unit if poses else None
         return CameraSet(cameras, relative, views, unit, program=self.program)
 
     def _of_project(self, found: Parts) -> CameraSet:

@@ -155,7 +155,7 @@ WOODSCAPE = Format(
     files="calibration of WoodScape, JSON, as the nearest fisheye",
     parts=_woodscape_parts,
     pose=PoseKeys("extrinsic/quaternion/3,0,1,2 extrinsic/translation", back=True, frame="vehicle"),
-    metres=True,
+    unit="m",
 )
 
 ORIENTATION = "place:3,angles:3,R:9/3,centre:2,f,glass:3"  # the rows of a .ori of OpenPTV

@@ -75,7 +75,7 @@ ORB_SLAM = replace(
     write=_storage,
     whole=lambda trees, cameras: {f"Camera.{key}": value for key, value in trees[0].items()},
     at_most=1,
-    metres=True,
+    unit="m",
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
 )
 
@@ -121,7 +121,7 @@ EUROC = Format(
     parts=_euroc_parts,
     pose=PoseKeys("T_BS", back=True),
     at_most=1,
-    metres=True,
+    unit="m",
     write=yaml_text,
     whole=lambda trees, cameras: {"sensor_type": "camera", "camera_model": "pinhole", **trees[0]},
     needs_size=True,
@@ -169,7 +169,7 @@ BASALT = Format(
     pose=PoseKeys("T_imu_cam/qw,qx,qy,qz:quaternion T_imu_cam/px,py,pz", back=True, frame="imu"),
     write=json_text,
     whole=_basalt_tree,
-    metres=True,
+    unit="m",
     needs_size=True,
     rig="`T_imu_cam` from each camera to the IMU",
 )
@@ -197,7 +197,7 @@ OKVIS = Format(
     files="its configuration, YAML",
     parts="cameras",
     pose=PoseKeys("T_SC", back=True),
-    metres=True,
+    unit="m",
     rig="`T_SC` from each camera to the body",
 )
 SVO = Format(
@@ -215,7 +215,7 @@ SVO = Format(
     files="SVO, rpg_vikit, maplab: YAML",
     parts="cameras",
     pose=PoseKeys("T_B_C", back=True),
-    metres=True,
+    unit="m",
     rig="`T_B_C` from each camera to the body",
 )
 
