@@ -140,9 +140,9 @@ MIDDLEBURY = Format(
 _MVSNET = re.compile(r"\A\s*extrinsic\s+((?:\S+\s+){16})intrinsic\s+((?:\S+\s+){9})").match
 
 
-def _mvsnet_parts(document: Document) -> dict[str, Field]:
-    found = _MVSNET(document.text)
-    assert found is not None  # `told`
+def _mvsnet(document: Document) -> dict[str, Field]:
+    if (found := _MVSNET(document.text[:5000])) is None:
+        return {}
     words = (found[1] + found[2]).split()
     return {"camera": in_order("extrinsic:16 intrinsic:9", words, document.source)}
 
@@ -151,9 +151,8 @@ MVSNET = Format(
     "MVSNet",
     "intrinsic",
     "none",
-    told=lambda document: _MVSNET(document.text[:5000]),
+    told=_mvsnet,
     files="cam.txt of MVSNet, BlendedMVS",
-    parts=_mvsnet_parts,
     pose=PoseKeys("extrinsic", frame="world"),
 )
 
@@ -162,13 +161,9 @@ def _krtd(document: Document) -> dict[str, Field]:
     found = in_rows("K:9/3,R:9/3,t:3,D:", document.text, document.source)
     if found is None or found.value["K"][6:] != [0, 0, 1] or len(found.value["D"]) not in (1, 4, 5, 8):
         return {}
-    return {"camera": found}
-
-
-def _krtd_parts(document: Document) -> dict[str, Field]:
-    if len(_krtd(document)["camera"].value["D"]) == 4:
+    if len(found.value["D"]) == 4:
         raise InputError("its four distortion coefficients may be k1, k2, p1, p2 or a fisheye's; write five")
-    return _krtd(document)
+    return {"camera": found}
 
 
 KRTD = Format(
@@ -180,7 +175,6 @@ KRTD = Format(
     """,
     told=_krtd,
     files=".krtd of KWIVER",
-    parts=_krtd_parts,
     pose=PoseKeys("R t", frame="world"),
 )
 
@@ -200,5 +194,4 @@ DROID = Format(
     "plumb_bob D",
     told=_droid,
     files="fx fy cx cy k1 k2 p1 p2 k3",
-    parts=_droid,
 )

@@ -227,8 +227,9 @@ class Format(CameraKeys):
 
     files: str = ""  # its files, for the documentation
     told: str | Callable[[Document], object] = ""  # keys at the top of a file, or what tells it
-    # What finds the trees of the cameras, or the path of a list of them.
-    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = lambda document: {"camera": document.root}
+    # What finds the trees of the cameras, or the path of a list of them. Without it, a file is told by these
+    # trees, or it is one.
+    parts: Callable[[Document], Mapping[str, Field | Tree]] | str = ""
     pose: PoseKeys | Callable[[Parts], Sequence[Pose | None]] | None = None  # keys of it, or what finds all
     unit: str | Callable[[Field], str | None] | None = None  # of lengths, or what finds it in the first tree
     views: Callable[[Field], Mapping[str, Pose]] | None = None  # what finds those of views in the first tree
@@ -283,15 +284,17 @@ class Format(CameraKeys):
             return self.told and set(self.told.split()) <= set(document.tree)
         return self.told(document)
 
-    def read(self, document: Document) -> CameraSet:
-        """Read the cameras of a file."""
+    def read(self, document: Document, told: object) -> CameraSet:
+        """Read the cameras of a file, from what told that it is of this format."""
         if self.reader is not None:
             return self.reader(document)
         parts: Mapping[str, Field | Tree]
         if callable(self.parts):
             parts = self.parts(document)
-        else:
+        elif self.parts:
             parts = {f"cam{k}": part for k, part in enumerate(at(document.root, self.parts).items())}
+        else:
+            parts = told if isinstance(told, dict) else {"camera": document.root}
         found = {
             name: one if isinstance(one, Field) else Field(one, document.source, name)
             for name, one in parts.items()

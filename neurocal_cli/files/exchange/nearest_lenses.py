@@ -125,12 +125,11 @@ OCAM = Format(
 _WOODSCAPE = ("k1", "k2", "k3", "k4", "cx_offset", "cy_offset", "width", "height")
 
 
-def _is_woodscape(document: Document) -> bool:
-    own = document.tree.get("intrinsic")
-    return isinstance(own, dict) and own.keys() >= set(_WOODSCAPE) and own.get("model") == "radial_poly"
-
-
-def _woodscape_parts(document: Document) -> dict[str, Tree]:
+def _woodscape(document: Document) -> dict[str, Tree]:
+    stated = document.tree.get("intrinsic")
+    told = isinstance(stated, dict) and {*_WOODSCAPE} <= set(stated) and stated.get("model") == "radial_poly"
+    if not told:
+        return {}
     own = document.root["intrinsic"]
     *k, u0, v0, _, _ = (own[key].number() for key in _WOODSCAPE)
     width, height = own["width"].integer(1), own["height"].integer(1)
@@ -151,9 +150,8 @@ WOODSCAPE = Format(
     "fisheye k",
     size="size",
     name="name",
-    told=_is_woodscape,
+    told=_woodscape,
     files="calibration of WoodScape, JSON, as the nearest fisheye",
-    parts=_woodscape_parts,
     pose=PoseKeys("extrinsic/quaternion/3,0,1,2 extrinsic/translation", back=True, frame="vehicle"),
     unit="m",
 )
@@ -202,9 +200,9 @@ def _of_run(place: Path) -> list[float]:
     return [ptv[name].number() for name in _PIXELS]
 
 
-def _openptv_parts(document: Document) -> dict[str, Tree]:
-    own = in_rows(ORIENTATION, document.text, document.source)
-    assert own is not None  # `told`
+def _openptv(document: Document) -> dict[str, Tree]:
+    if (own := in_rows(ORIENTATION, document.text, document.source)) is None:
+        return {}
     path = Path(document.source)
     pixels, broken = _pixels(path)
     lens = path.with_suffix(".addpar")
@@ -271,9 +269,8 @@ OPENPTV = Format(
     "K",
     "plumb_bob D",
     size="size",
-    told=lambda document: in_rows(ORIENTATION, document.text),
+    told=_openptv,
     files=".ori with its .addpar; ptv.par beside it or in ../parameters, or a run of pyptv",
-    parts=_openptv_parts,
     pose=PoseKeys("R t", frame="world"),
     unit="mm",
     has_skew=True,

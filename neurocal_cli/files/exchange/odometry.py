@@ -245,9 +245,9 @@ _DSO_LINES = re.compile(
 ).match
 
 
-def _dso_parts(document: Document) -> dict[str, Field]:
-    found = _DSO_LINES(document.text)
-    assert found is not None  # `matches`
+def _dso(document: Document) -> dict[str, Field]:
+    if (found := _DSO_LINES(document.text)) is None:
+        return {}
     root = in_order("size:2 fx fy cx cy D:", [*found[3].split(), *found[2].split()], document.source)
     tree, (width, height) = root.value, root.value["size"]
     if tree["cx"] < 1 and tree["cy"] < 1:
@@ -268,8 +268,7 @@ DSO = Format(
     """,
     model="model",
     size="size",
-    told=lambda document: _DSO_LINES(document.text),
+    told=_dso,
     files="camera.txt of DSO, LDSO, TUM's monocular data",
-    parts=_dso_parts,
     finish=with_fov,
 )

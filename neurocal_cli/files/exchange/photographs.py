@@ -222,18 +222,14 @@ LENSFUN = Format(
 
 
 # Open3D writes matrices by columns.
-def _open3d_parts(document: Document) -> dict[str, Field]:
-    root = document.root
-    inner = root.get("intrinsic", root.value)
-    return {"camera": Field({**inner.value, "extrinsic": root.get("extrinsic").value}, root.source)}
-
-
-def _by_columns(document: Document) -> bool:
-    """Whether there is a flat intrinsic_matrix with the principal point in its last column."""
+def _open3d(document: Document) -> dict[str, Field]:
+    """The camera of a flat intrinsic_matrix with the principal point in its last column."""
     inner = document.tree.get("intrinsic") or document.tree
     m = inner.get("intrinsic_matrix") if isinstance(inner, dict) else None
     flat = isinstance(m, list) and len(m) == 9 and not any(isinstance(entry, (list, str)) for entry in m)
-    return flat and m is not None and m[2] == m[5] == 0 and m[8] == 1 and m[6] != 0
+    if not (flat and m is not None and m[2] == m[5] == 0 and m[8] == 1 and m[6] != 0):
+        return {}
+    return {"camera": Field({**inner, "extrinsic": document.tree.get("extrinsic")}, document.source)}
 
 
 OPEN3D = Format(
@@ -241,9 +237,8 @@ OPEN3D = Format(
     "intrinsic_matrix:columns",
     "none",
     size="width,height",
-    told=_by_columns,
+    told=_open3d,
     files="PinholeCameraIntrinsic, PinholeCameraParameters, JSON",
-    parts=_open3d_parts,
     pose=PoseKeys("extrinsic:columns", frame="world"),
     write=json_text,
     needs_size=True,

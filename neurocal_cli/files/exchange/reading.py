@@ -310,12 +310,13 @@ def _read(document: Document, whole: bool = True) -> CameraSet:
         for refused, problem in _REFUSED:
             if _is(document, refused):
                 raise InputError(problem)
-        one = next((one for one in READ if one.matches(document)), None)
+        found_of = ((one, told) for one in READ if (told := one.matches(document)))
+        one, told = next(found_of, (None, None))
         if one is None:
             raise InputError(UNKNOWN)
         own = not whole and one is neurocal.FORMAT
         try:
-            found = neurocal.without_points(document.root) if own else one.read(document)
+            found = neurocal.without_points(document.root) if own else one.read(document, told)
         except NoCameraError as error:
             raise InputError(f"{error}{_nearest(document)}") from error
         for camera in found.cameras:

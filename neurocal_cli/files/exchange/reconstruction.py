@@ -204,12 +204,15 @@ ALICEVISION = Format(
 _OLD, _CENTRED = {"projection_type": "perspective"}, {"c_x": 0.0, "c_y": 0.0}
 
 
-def _shots(document: Document) -> dict[str, Field]:
-    return {
+def _opensfm(document: Document) -> dict[str, Field]:
+    tree = document.tree
+    alone = {"projection_type", "width", "height"} <= set(tree) and "focal" in str(tree)
+    shots = {
         name: Field({**_OLD, **({} if "focal_x" in part else _CENTRED), **part}, document.source, name)
-        for name, part in document.tree.items()
+        for name, part in tree.items()
         if isinstance(part, dict) and {"focal", "focal_x"} & set(part) and {"width", "height"} <= set(part)
     }
+    return shots or ({"": document.root} if alone else {})
 
 
 OPENSFM = Format(
@@ -228,12 +231,8 @@ OPENSFM = Format(
     first_pixel=0.5,
     from_middle=True,
     by_longer_side=True,
-    told=lambda document: (
-        _shots(document)
-        or ({"projection_type", "width", "height"} <= set(document.tree) and "focal" in str(document.tree))
-    ),
+    told=_opensfm,
     files="cameras.json, reference of a camera model; also of OpenDroneMap",
-    parts=lambda document: _shots(document) or {"": document.root},
     project=True,
 )
 
@@ -241,9 +240,9 @@ OPENSFM = Format(
 _PIX4D_HEAD = re.compile(r"\A\s*fileName imageWidth imageHeight\s.*?\[R\|-Rt\] X\s*\n", re.DOTALL).match
 
 
-def _pix4d_parts(document: Document) -> dict[str, Field]:
-    head = _PIX4D_HEAD(document.text)
-    assert head is not None  # `told`
+def _pix4d(document: Document) -> dict[str, Field]:
+    if (head := _PIX4D_HEAD(document.text[:2000])) is None:
+        return {}
     lines = [line for line in document.text[head.end() :].splitlines() if line.strip()]
     parts = {}
     for k in range(0, len(lines), 10):
@@ -265,9 +264,8 @@ PIX4D = Format(
     "K",
     "plumb_bob radial/0-1 tangential/0-1 radial/2",
     size="size",
-    told=lambda document: _PIX4D_HEAD(document.text[:2000]),
+    told=_pix4d,
     files="calibrated_camera_parameters.txt",
-    parts=_pix4d_parts,
     pose=PoseKeys("R t", centre=True),
     project=True,
     poses=True,

@@ -206,13 +206,9 @@ _DEWARP = re.compile(rb"Dewarp ?Data\s*[=:>]\s*[\"']?(?:[-\d]+;)?((?:\s*[-+.\deE
 _XMP_BYTES = 300_000  # of a photograph, in which its XMP stands
 
 
-def _dewarp(document: Document) -> re.Match[bytes] | None:
-    return _DEWARP.search(document.data[:_XMP_BYTES])
-
-
-def _dji_parts(document: Document) -> dict[str, Field]:
-    found = _dewarp(document)
-    assert found is not None  # `told`
+def _dji(document: Document) -> dict[str, Field]:
+    if (found := _DEWARP.search(document.data[:_XMP_BYTES])) is None:
+        return {}
     size = document.size
     if not document.is_text:
         header = read_header(document.data, document.source)
@@ -230,7 +226,6 @@ DJI = Format(
     size="size",
     first_pixel=0.5,
     from_middle=True,
-    told=_dewarp,
+    told=_dji,
     files="photographs with DewarpData, or its text with `--image-size`",
-    parts=_dji_parts,
 )
