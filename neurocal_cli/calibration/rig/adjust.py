@@ -132,6 +132,11 @@ class RigFit:
     iterations: int
     converged: bool
 
+    @cached_property
+    def arrow(self) -> Arrowhead:
+        """Normal equations of the unknowns that moved."""
+        return self.normal.only(np.flatnonzero(self.free))
+
     @property
     def cost(self) -> float:
         """Sum of squared whitened residuals."""

@@ -66,7 +66,7 @@ def covariance_by_points(fit: RigFit) -> Covariance:
     Points that do not determine the unknowns are an error.
     """
     free, problem = np.flatnonzero(fit.free), fit.problem
-    found = fit.normal.only(free).covariance(fit.variance)
+    found = fit.arrow.covariance(fit.variance)
     if not found.smallest > SINGULAR:
         raise DegenerateGeometryError(
             "the points do not determine the rig and its cameras (the normal matrix is singular); "
@@ -91,7 +91,7 @@ def contradicting_covariance(fit: RigFit) -> Array:
     It is not smaller than that of independent points, nor than that by the jackknife over the frames, of
     which there must be enough.
     """
-    model = fit.normal.only(np.flatnonzero(fit.free)).covariance().shared
+    model = fit.arrow.covariance().shared
     if fit.problem.together.sum() < _LEAST_FRAMES:
         squares, degrees = scatter(fit)
         return np.asarray(max(squares / max(degrees, 1), 1.0) * model)
@@ -102,37 +102,31 @@ def covariance_over_frames(fit: RigFit) -> Array:
     """(f, f) covariance of the free shared unknowns by the delete-one jackknife over the frames.
 
     Without frame k the unknowns move by x with (S - S_k) x = -g_k, where S_k and g_k are the frame's own part
-    of the normal equations. They are 0 but in the columns of the cameras that saw the frame, so only these
-    are solved for: with G = S^-1, x = G (S_k x - g_k).
+    of the normal equations. They are 0 but in the columns c of the cameras that saw the frame, so only these
+    are solved for: with G = S^-1, x = -G_c (1 - S_k G_cc)^-1 g_k.
     """
-    problem, free = fit.problem, np.flatnonzero(fit.free)
-    views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
-    arrow = fit.normal.only(free)
+    problem, free, arrow = fit.problem, np.flatnonzero(fit.free), fit.arrow
     reduced, solved = arrow.reduced()
-    inverse = solve_scaled(reduced[:-1, :-1], np.eye(len(free)))
-    step = inverse @ reduced[:-1, -1]  # to the minimum, if the cameras were not refined
+    G = solve_scaled(reduced[:-1, :-1], np.eye(len(free)))
+    step = G @ reduced[:-1, -1]  # to the minimum, if the cameras were not refined
     # Of each column among the free ones; the residual comes after them.
     number = np.full(len(fit.free) + 1, -1)
-    number[free], number[-1] = np.arange(len(free)), len(free)
+    number[np.append(free, -1)] = np.arange(len(free) + 1)
     of_frames: list[list[tuple[NDArray[np.intp], Array]]] = [[] for _ in problem.scale]
-    for one in views:
-        for frame, M in zip(one.frame.tolist(), one.M, strict=True):
-            of_frames[frame].append((number[one.place], M))
+    for one in problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)]):
+        kept = np.flatnonzero(number[one.place] >= 0)
+        for frame, M in zip(one.frame.tolist(), one.M[:, kept[:, None], kept], strict=True):
+            of_frames[frame].append((number[one.place[kept]], M))
     moves = np.empty((len(of_frames), len(free)))
     for k, parts in enumerate(of_frames):
-        seen = np.zeros(len(free) + 1, dtype=bool)
-        for place, _ in parts:
-            seen[place[place >= 0]] = True
-        local = np.cumsum(seen) - 1
+        seen = np.unique(np.concatenate([place for place, _ in parts]))
         left = -arrow.cross[k][:, seen].T @ solved[k][:, seen]
         for place, M in parts:
-            kept = np.flatnonzero(place >= 0)
-            at = local[place[kept]]
-            left[np.ix_(at, at)] += M[np.ix_(kept, kept)]
-        columns, S = np.flatnonzero(seen[:-1]), left[:-1, :-1]
-        g, G = left[:-1, -1] - S @ step[columns], inverse[:, columns]
-        x = solve_scaled(np.eye(len(S)) - G[columns] @ S, -(G[columns] @ g)[:, None])[:, 0]
-        moves[k] = G @ (S @ x - g)
+            at = np.searchsorted(seen, place)
+            left[np.ix_(at, at)] += M
+        c, S = seen[:-1], left[:-1, :-1]
+        g = left[:-1, -1:] - S @ step[c, None]
+        moves[k] = -(G[:, c] @ solve_scaled(np.eye(len(c)) - S @ G[np.ix_(c, c)], g))[:, 0]
     return jackknife(moves[np.isfinite(moves).all(axis=1)])
 
 
@@ -169,7 +163,7 @@ def information_of_rig(target: Target, fit: RigFit) -> tuple[Information, Prior]
         pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", seen.pose_point, by_pose)
     equations = sum(observed.views.n_equations for observed in problem.observations)
     by_shared = by_shared[:, :, np.append(shared, -1)]
-    info = Information(fit.normal.only(shared), point, by_shared, pose_point, equations)
+    info = Information(fit.arrow, point, by_shared, pose_point, equations)
     prior = prior_of_target(target)
     return info.turned(prior.axes).around_given(prior.along_axes(target.offsets)), prior
 

@@ -99,7 +99,7 @@ def relative_poses(problem: RigProblem, rig: Pose) -> RelativePoses | None:
     free, state = problem.estimated_shared, problem.start([rig])
     fit = RigFit(problem, free, state, problem.normal(state)[0], 0, True)
     shared = np.flatnonzero(free)
-    arrow = fit.normal.only(shared)
+    arrow = fit.arrow
     steps = MOVED_CAMERA.steps(fit, 1, None)
     A, bordered, _ = along(arrow, problem.paired, [seen_by(fit, 1, shared)], {0: steps})
     solved = solve_scaled(A, np.concatenate([bordered, np.broadcast_to(np.eye(6), A.shape)], axis=2))
