@@ -84,30 +84,33 @@ def middle_of_image(problem: Problem) -> Array:
 
 def _best_strength(radial: _Radial, seed: int) -> Array:
     """lambda_1 and lambda_2 with the smallest error: a scan of lambda_1, then a pattern search in both."""
-    row = [np.array([value, 0.0]) for value in _STRENGTHS]
-    error, best = min(((_error(radial, one, seed), one) for one in row), key=lambda tried: tried[0])
-    step = _STEP
-    for _ in range(_ROUNDS):
-        around = [best + step * way for way in _WAYS]
-        tried = [(_error(radial, one, seed), one) for one in around if _one_to_one(one)]
-        lowest = min(tried, key=lambda one: one[0], default=(np.inf, best))
-        if lowest[0] < error:
-            error, best = lowest
+    tried = np.array([(value, 0.0) for value in _STRENGTHS])
+    best, error, step = tried[0], np.inf, _STEP
+    for _ in range(1 + _ROUNDS):
+        errors = _errors(radial, tried, seed)
+        if len(errors) and errors.min() < error:
+            best, error = tried[errors.argmin()], errors.min()
         else:
             step = step / 2
+        tried = np.array([one for one in best + step * _WAYS if _one_to_one(one)])
     return best
 
 
-def _error(radial: _Radial, strength: Array, seed: int) -> float:
-    """Squared error of all free networks in the observed pixels."""
-    problem = radial.corrected(strength)
+def _errors(radial: _Radial, strengths: Array, seed: int) -> Array:
+    """(n,) squared errors of all free networks in the observed pixels; all of them are trained together."""
+    if not len(strengths):
+        return np.zeros(0)
+    problem = radial.corrected(*strengths)
     able = np.ones(problem.views.n_views, dtype=bool)
     scan = options_for("lm", _SCAN_STARTS, seed)
     groups, _ = train_networks(problem, scan, np.random.default_rng(seed), able)
-    # The networks' weights have mean 1.
-    weight = problem.views.pixel_scale**2 * (1 / radial.magnification(strength)).mean()
-    error = weight * sum(float(group.bound.sum()) for group in groups)
-    return float(error) if np.isfinite(error) else np.inf
+    errors = np.zeros(len(able))
+    for group in groups:
+        errors[group.views] = group.bound
+    errors = errors.reshape(len(strengths), -1).sum(axis=1)
+    # The networks' weights have mean 1, over all strengths.
+    weights = np.concatenate([1 / radial.magnification(one) for one in strengths])
+    return np.nan_to_num(problem.views.pixel_scale**2 * weights.mean() * errors, nan=np.inf)
 
 
 @frozen_dataclass(eq=False)
@@ -118,14 +121,17 @@ class _Radial:
     middle: Array  # (2,) of the image [px]
     reach: float  # distance at which the model's terms are lambda_1 and lambda_2 [px]
 
-    def corrected(self, strength: Array) -> Problem:
-        """The problem of a pinhole camera, with the pixels undistorted."""
-        points = self.problem.points
-        variance = self.magnification(strength)
+    def corrected(self, *strengths: Array) -> Problem:
+        """The problem of a pinhole camera, its pixels undistorted, of all views by each strength."""
+        points, n = self.problem.points, len(strengths)
+        away, share = points.pixels - self.middle, self._share()
+        pixels = [self.middle + away / even_polynomial(one, share)[:, None] for one in strengths]
+        variance = np.concatenate([self.magnification(one) for one in strengths])
+        view = np.concatenate([points.view_index + k * points.n_views for k in range(n)])
         seen = Correspondences(
-            points.world,
-            self.middle + (points.pixels - self.middle) / even_polynomial(strength, self._share())[:, None],
-            points.view,
+            np.tile(points.world, (n, 1)),
+            np.concatenate(pixels),
+            points.view if n == 1 else view,
             covariance=np.column_stack([variance, np.zeros_like(variance), variance]),
         )
         return self.problem.with_model("none").with_points(seen)
