@@ -70,6 +70,15 @@ def test_boards_with_markers_are_found(form: str, legacy: bool, first_id: int) -
         assert plane.markers.side == pytest.approx(true.markers.side / true.square, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("form", "square"), [("charuco:6x5:40:30:DICT_6X6_50", 32), ("aprilgrid:4x3:40:0.25:tag36h11", 34)]
+)
+def test_codes_are_read_though_a_blur_mixes_their_cells(form: str, square: float) -> None:
+    true = plane_of(form)
+    found = found_board([taken(marked_scene(true, 1, square=square, psf=1.6, noise=4.0), 1, 4).image]).plane
+    assert (kind_of(found), found.cols, found.rows) == (kind_of(true), true.cols, true.rows)
+
+
 def test_the_side_of_the_markers_is_told_by_one_between_four_vertices() -> None:
     found = board_in("charuco:3x5:30:22:DICT_6X6_250", square=40.0)
     assert found.plane.markers is not None

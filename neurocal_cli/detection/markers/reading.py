@@ -202,6 +202,7 @@ def _detector(dictionary: str, first: int, count: int, border: int):  # type: ig
 
 _WITHIN = (-0.25, 0.0, 0.25)  # of a cell, where it is sampled
 _WRONG_BORDER, _ROUGHLY_WRONG = 0.1, 0.3  # greatest share of light cells in a border
+_ROUNDS = 2  # in which a cell's light is compared with that of the cells beside it, which a blur mixes
 _EXTREME = 0.2  # share of the darkest and of the lightest cells that give the levels
 _CONTRAST = 12.0  # DN, least difference of these
 _FEWEST = 2  # markers
@@ -311,12 +312,16 @@ def _cells(
     inner, good = np.zeros((len(H), bits, bits), dtype=np.bool_), np.ones(len(H), dtype=np.bool_)
     # A look at the middles of the cells leaves few.
     for within, most in (((0.0,), _ROUGHLY_WRONG), (_WITHIN, _WRONG_BORDER)):
-        ticks = (np.arange(side)[:, None] + 0.5 + np.array(within)).ravel() / side
+        ticks = (np.arange(-_ROUNDS, side + _ROUNDS)[:, None] + 0.5 + np.array(within)).ravel() / side
         places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-        n, at = len(within), np.flatnonzero(good)
+        n, at, wide = len(within), np.flatnonzero(good), side + 2 * _ROUNDS
         if not len(at):
             break
-        level = _sampled(grey, H[at], places).reshape(len(at), side, n, side, n).mean(axis=(2, 4))
+        level = _sampled(grey, H[at], places).reshape(len(at), wide, n, wide, n).mean(axis=(2, 4))
+        for _ in range(_ROUNDS):
+            columns, rows = level[:, 1:-1], level[:, :, 1:-1]
+            beside = columns[..., 2:] + columns[..., :-2] + rows[:, 2:] + rows[:, :-2]
+            level = 2 * level[:, 1:-1, 1:-1] - 0.25 * beside
         low, high = _levels(level.reshape(len(at), -1))
         light = level > 0.5 * (low + high)[:, None, None]
         inner[at] = light[:, border:-border, border:-border]
