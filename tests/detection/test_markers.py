@@ -36,7 +36,7 @@ from neurocal_cli.detection.markers.lattice import (
     tell_a_plane,
 )
 from neurocal_cli.detection.markers.locate import locate
-from neurocal_cli.detection.markers.reading import Marks, numbers_in, read_markers
+from neurocal_cli.detection.markers.reading import Marks, candidates, looks_at, markers_in, numbers_in
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.detection.wide_lens import Flattening, WideLens
@@ -337,7 +337,8 @@ def test_the_outline_inside_a_blurred_border_is_not_that_of_the_marker() -> None
     scene = marked_scene(plane_of("arucogrid:3x2:40:0.25:DICT_4X4_50"), 6, square=56.0, psf=1.6)
     picture = taken(scene, 6)
     places, _ = truth_of(picture)
-    marks, _ = next(read_markers(picture.image, "DICT_4X4_50", 0, 6))
+    every = candidates(next(looks_at(picture.image)))
+    marks = markers_in(picture.image, every, "DICT_4X4_50", 1, 0, 6)
     assert sorted(marks.number) == list(range(6))
     for number, corners in zip(marks.number, marks.corners, strict=True):
         true = np.array([places[f"{number}:{k}"] for k in range(4)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -26,7 +26,16 @@ from neurocal_cli.detection.markers.lattice import (
     read_together,
 )
 from neurocal_cli.detection.markers.numbering import lie_of
-from neurocal_cli.detection.markers.reading import SMALL, USUAL, Marks, codes_in, read_codes, read_markers
+from neurocal_cli.detection.markers.reading import (
+    SMALL,
+    USUAL,
+    Marks,
+    View,
+    candidates,
+    codes_in,
+    looks_at,
+    markers_in,
+)
 from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
@@ -34,7 +43,7 @@ from neurocal_cli.observations.board_kinds import TagPlane
 from neurocal_cli.observations.marked_cells import Cells, marked_cells, pattern_lines, patterns, prints
 from neurocal_cli.observations.markers import DICTIONARIES, code_count
 
-_ENOUGH = 4  # markers that agree, after which no other dictionary is tried
+_ENOUGH = 4  # markers that are no chance
 _MOST = 0.5  # share of the markers after which no other scale is tried
 _WITH_SQUARES = 0.5  # share of the corners of tags that are vertices if there are squares at them
 _PLACED = 0.5  # least share of the markers that were read that are where the board has them
@@ -55,32 +64,37 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
     Raises NoBoardError if there are not two markers of one plane, with the reason as far as it is known.
     """
     grey, light = eight_bits(image), grey_levels(image)
-    located, notes = [], []
-    read, quadrangles = 0, list[Array]()
+    looks, quadrangles = looks_at(grey), list[Array]()
+    located, notes, read = [], [], 0
     for index, plane in enumerate(board.planes):
         if plane.markers is None:
             raise InputError("a board has markers on all its planes, or on none; describe them in two files")
-        placed = _placed(plane, grey, quadrangles)
-        if placed is not None and isinstance(plane, TagPlane) and plane.downwards:
+        placed = _placed(plane, grey, _quadrangles(looks, quadrangles))
+        # Of a border of two cells, the inner one may be seen alone, so those of one cell are not sure.
+        if isinstance(plane, TagPlane) and (placed is None or plane.border == 1):
+            _check_border(plane, grey, quadrangles)
+        if placed is None:
+            continue
+        if isinstance(plane, TagPlane) and plane.downwards:
             _check_spacing(plane, placed.marks)
-        found = None if placed is None else _vertices(plane, placed, light)
-        if placed is None or found is None:
-            read = max(read, 0 if placed is None else len(placed.at))
+        found, agree = _vertices(plane, placed, light), len(np.unique(placed.at))
+        misplaced = agree < _PLACED * placed.read
+        if found is None and (agree < _ENOUGH or not misplaced or placed.unsure):
+            read = max(read, agree)
             continue
         if placed.unsure:
             raise NoBoardError(
                 "the markers fit today's and the legacy pattern of OpenCV; show more of the board, or give "
                 "legacy: true or false in a board file"
             )
-        one = _located(plane, index, placed, *found)
-        few = len(np.unique(placed.at)) < _PLACED * placed.read
-        if few or not _shows_its_codes(one, placed.marks.dictionary, light):
+        one = None if found is None else _located(plane, index, placed, *found)
+        if one is None or misplaced or not _shows_its_codes(one, placed.marks.dictionary, light):
             raise NoBoardError(
                 "most markers are not where the board has them, as if it had another number of columns; "
                 "correct its description, or leave out --board, so that the board is found"
             )
         located.append(one)
-        notes.append(_told(plane, placed, found[0]))
+        notes.append(_told(plane, placed, one.grid))
     if not located:
         raise NoBoardError(_reason(board, grey, read, quadrangles))
     return Identified(tuple(located), notes=tuple(dict.fromkeys(note for note in notes if note)))
@@ -121,11 +135,16 @@ def _vertices(plane: Plane, placed: Placed, light: Image) -> tuple[Grid, tuple[i
     return corners_of_tags(plane, placed) if isinstance(plane, TagPlane) and few else found
 
 
-def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: list[Array]) -> Placed | None:
-    """The markers of a plane, of the dictionary of which most agree with each other.
+def _quadrangles(looks: Iterator[Sequence[View]], found: list[Array]) -> Iterator[Array]:
+    """Quadrangles that may be markers of any dictionary: those found before, and those of other looks."""
+    yield from list(found)
+    for look in looks:
+        found.append(candidates(look))
+        yield found[-1]
 
-    The `quadrangles` that may be markers of any dictionary are added to the list.
-    """
+
+def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: Iterable[Array]) -> Placed | None:
+    """The markers of a plane within quadrangles, of the dictionary of which most agree with each other."""
     markers = plane.markers
     assert markers is not None
     count = len(marked_cells(plane, next(prints(plane))).number)
@@ -138,30 +157,30 @@ def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: list[Array]) -> 
             "dictionary or the number of squares"
         )
     best: Placed | None = None
-    dictionaries = [named or USUAL[0]]
-    for dictionary in dictionaries:
-        for marks, every in read_markers(grey, dictionary, first, count, border):
-            if len(dictionaries) == 1:
-                quadrangles.append(every)
-            placed = place(plane, marks)
+    read: dict[str, Marks] = {}
+    for every in quadrangles:
+        for dictionary in (named,) if named else USUAL:
+            marks = markers_in(grey, every, dictionary, border, first, count)
+            read[dictionary] = marks.with_others(read.get(dictionary))
+            placed = place(plane, read[dictionary])
             if placed is not None and (best is None or len(placed.at) > len(best.at) or best.unsure):
                 best = placed
-            if best is not None and len(best.at) >= _MOST * count and not best.unsure:
-                break
-        if best is not None and len(best.at) >= _ENOUGH:
+        if best is not None and len(best.at) >= _MOST * count and not best.unsure:
             break
-        if not named and len(dictionaries) == 1:
-            seen = {marks.dictionary for marks, cells in _codes(grey, quadrangles) if cells == border}
-            dictionaries += [one for one in USUAL[1:] if one in seen]
     if best is None and named and not isinstance(plane, TagPlane) and max(grey.shape) <= SMALL:
         together = (read_together(plane, named, grid, grey_levels(grey)) for grid in find_grids(grey))
         best = next((place(plane, marks) for marks in together if marks is not None), None)
     return best
 
 
-def _codes(grey: NDArray[np.uint8], quadrangles: Sequence[Array]) -> Iterator[tuple[Marks, int]]:
-    """Markers of any dictionary and the widths of their borders, at each scale."""
-    return chain.from_iterable(codes_in(grey, every) for every in quadrangles)
+def _check_border(plane: TagPlane, grey: NDArray[np.uint8], quadrangles: Iterable[Array]) -> None:
+    """Refuse tags that are read with the other width of the border."""
+    assert plane.markers is not None
+    name, first, count = plane.markers.dictionary, plane.markers.first_id, plane.tags[0] * plane.tags[1]
+    read = [markers_in(grey, every, name, 3 - plane.border, first, count) for every in quadrangles if name]
+    if len({number for marks in read for number in marks.number.tolist()}) >= _ENOUGH:
+        cells = "a border of one cell" if plane.border == 2 else "a border of two cells"
+        raise NoBoardError(f"the tags have {cells}; say border: {3 - plane.border} in a board file")
 
 
 def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[int, int]) -> Located:
@@ -230,16 +249,7 @@ def _reason(board: Board, grey: NDArray[np.uint8], read: int, quadrangles: Seque
             "seen; show it sharper or nearer, or use a board that has them"
         )
     named = {plane.markers.dictionary for plane in board.planes if plane.markers is not None} - {""}
-    tags = next((plane for plane in board.planes if isinstance(plane, TagPlane)), None)
-    seen = list(_codes(grey, quadrangles)) if named else []
-    own = [one for one in seen if any(codes_alike(one[0].dictionary, name) for name in named)]
-    if tags is not None and any(len(marks) >= _ENOUGH for marks, _ in own):
-        # The quadrangles are those of tags with the border that is described.
-        own += [one for one in read_codes(grey)[0] if codes_alike(one[0].dictionary, own[0][0].dictionary)]
-        for marks, border in own:
-            if border != tags.border and len(marks) >= _ENOUGH:
-                cells = "a border of one cell" if border == 1 else "a border of two cells"
-                return f"the tags have {cells}; say border: {border} in a board file"
+    seen = chain.from_iterable(codes_in(grey, every) for every in quadrangles) if named else ()
     for marks, _ in seen:
         if not any(codes_alike(marks.dictionary, one) for one in named) and len(marks) >= _STRANGE:
             return (

@@ -1,12 +1,8 @@
 """Read the markers in an image: their numbers and, to about a pixel, their corners.
 
-Of a known dictionary only the codes that the board has are looked for. OpenCV compares each candidate with
-all codes of a dictionary, so this is ten times as fast as a dictionary of a thousand, and a number that the
-board does not have cannot be read.
-
-If nothing is known, neither the dictionary nor the width of the border, OpenCV finds the quadrangles that may
-be markers. Their cells are sampled for each size of a code, and compared with the codes of all predefined
-dictionaries.
+OpenCV finds the quadrangles that may be markers. Their cells are sampled for each size of a code and each
+width of the border. They are compared with the codes that the board has, so that a number that it does not
+have cannot be read; or, if nothing is known, with the codes of all predefined dictionaries.
 """
 
 from __future__ import annotations
@@ -14,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import pairwise
-from typing import Any
+from itertools import pairwise, product
 
 import cv2
 import numpy as np
@@ -45,8 +40,7 @@ _LONGEST = 2200  # px; larger images are halved first, which still shows the mar
 SMALL, _ENLARGED = 1000, 3.0  # px; smaller images are enlarged by a factor if markers cannot be read
 _WINDOWS = (5, 29, 8)  # px; least and greatest window of the adaptive threshold, and its step
 _SMALLEST = 6.0  # px, least side of a marker
-# Of its perimeter; of two nearer quadrangles, one is left out, and the distance of two outlines of its border
-_APART, _RING = 0.02, 0.08
+_APART = 0.02  # of its perimeter; of two nearer quadrangles, one is left out
 
 
 @frozen_dataclass(eq=False)
@@ -83,47 +77,20 @@ class View:
     origin: tuple[int, int] = (0, 0)  # (u, v) [px of the original] of its first pixel
 
 
-def read_markers(
-    grey: NDArray[np.uint8], dictionary: str, first: int, count: int, border: int = 1
-) -> Iterator[tuple[Marks, Array]]:
-    """Read the markers ``first`` to ``first + count - 1`` of a dictionary, in one or more looks at an image.
-
-    Each look adds to those before it, and the caller stops when enough are read. With them come quadrangles
-    (N, 4, 2) [px] that may be markers of any dictionary. `border` is the width of a border in cells.
-    """
-    detector = _detector(dictionary, first, count, border)
-    if detector is None:
-        return
-    marks: Marks | None = None
-    for look in looks_at(grey):
-        number, corners, rejected = _detected(detector, look)
-        seen = _outlined(grey, Marks(number + first, corners, dictionary), rejected, border)
-        marks = seen.with_others(marks)
-        yield marks, np.concatenate([corners, rejected])
-
-
-def _outlined(grey: NDArray[np.uint8], marks: Marks, others: Array, border: int) -> Marks:
-    """The markers with the widest quadrangles around them, of others (N, 4, 2), in which they are read, too.
-
-    Narrow windows of the threshold see a blurred border as a ring, which has an outline inside as well.
-    """
-    if not len(marks):
-        return marks
-    corners, read = marks.corners.copy(), numbers_in(grey, others, marks.dictionary, border)
-    for k, own in enumerate(marks.corners):
-        for other in others[read == marks.number[k]]:
-            turned = np.stack([np.roll(other, turn, axis=0) for turn in range(4)])
-            away = np.linalg.norm(turned - own, axis=2).max(axis=1)
-            sides = [np.linalg.norm(np.diff(one, axis=0), axis=1).sum() for one in (corners[k], other)]
-            if away.min() < _RING * sides[0] and sides[0] < sides[1]:
-                corners[k] = turned[away.argmin()]
-    return replace(marks, corners=corners)
-
-
 def candidates(look: Sequence[View]) -> Array:
     """Quadrangles (N, 4, 2) [px] that may be markers of any dictionary."""
-    detector = _detector(USUAL[0], 0, 1, 1)
-    return np.zeros((0, 4, 2)) if detector is None else np.concatenate(_detected(detector, look)[1:])
+    found = [np.zeros((0, 4, 2))]
+    detector = _detector()
+    for view in look if detector is not None else ():
+        parameters = detector.getDetectorParameters()
+        parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(view.scale, 1.0) / max(view.image.shape)
+        detector.setDetectorParameters(parameters)
+        read, _, others = detector.detectMarkers(view.image)
+        for corners in (read, others):
+            # OpenCV's corners lie on the centres of the outermost dark pixels.
+            pixels = (np.array(corners, dtype=float).reshape(-1, 4, 2) + 0.5) / view.scale - 0.5
+            found.append(pixels + np.array(view.origin))
+    return np.concatenate(found)
 
 
 def looks_at(grey: NDArray[np.uint8]) -> Iterator[list[View]]:
@@ -153,24 +120,6 @@ def _parts(view: View, parts: Iterable[Sequence[slice]]) -> list[View]:
     ]
 
 
-def _detected(detector: Any, look: Sequence[View]) -> tuple[NDArray[np.int64], Array, Array]:
-    """Numbers (M,) and corners (M, 4, 2) of the markers, and corners (N, 4, 2) of other quadrangles [px]."""
-    none = np.zeros((0, 4, 2))
-    numbers, read, others = [np.zeros(0, dtype=np.int64)], [none], [none]
-    for view in look:
-        parameters = detector.getDetectorParameters()
-        parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(view.scale, 1.0) / max(view.image.shape)
-        detector.setDetectorParameters(parameters)
-        corners, ids, rejected = detector.detectMarkers(view.image)
-        for found, places in ((corners, read), (rejected, others)):
-            # OpenCV's corners lie on the centres of the outermost dark pixels.
-            pixels = (np.array(found, dtype=float).reshape(-1, 4, 2) + 0.5) / view.scale - 0.5
-            places.append(pixels + np.array(view.origin))
-        if ids is not None:
-            numbers.append(np.asarray(ids).reshape(-1).astype(np.int64))
-    return np.concatenate(numbers), np.concatenate(read), np.concatenate(others)
-
-
 def _scaled(view: View, scale: float) -> View:
     size = [max(1, round(scale * length)) for length in view.image.shape[::-1]]
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LANCZOS4
@@ -178,26 +127,21 @@ def _scaled(view: View, scale: float) -> View:
     return View(image, scale * view.scale, view.origin)
 
 
-def _detector(dictionary: str, first: int, count: int, border: int):  # type: ignore[no-untyped-def]
-    """OpenCV's detector of some codes of a dictionary; None if it does not have them or there is no aruco."""
+@lru_cache
+def _detector():  # type: ignore[no-untyped-def]
+    """OpenCV's detector of markers, of which only its quadrangles are used; None if there is no aruco."""
     aruco = getattr(cv2, "aruco", None)
-    if aruco is None or not hasattr(aruco, "ArucoDetector") or first + count > code_count(dictionary):
+    if aruco is None or not hasattr(aruco, "ArucoDetector"):
         return None
-    family = aruco.getPredefinedDictionary(getattr(aruco, dictionary))
-    codes = np.ascontiguousarray(family.bytesList[first : first + count])
-    some = aruco.Dictionary(codes, DICTIONARIES[dictionary], family.maxCorrectionBits)
+    family = aruco.getPredefinedDictionary(aruco.DICT_4X4_50)
     parameters = aruco.DetectorParameters()
-    parameters.markerBorderBits = border
     least, most, step = _WINDOWS
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least, most
     parameters.adaptiveThreshWinSizeStep = step
     # A marker is not left out because the square around it looks like one, too.
     parameters.minMarkerDistanceRate = _APART
-    # More is allowed than by default, which helps with small markers; false ones do not fit the board.
-    parameters.polygonalApproxAccuracyRate = 0.06
-    parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
-    parameters.maxErroneousBitsInBorderRate = 0.5
-    return aruco.ArucoDetector(some, parameters)
+    parameters.polygonalApproxAccuracyRate = 0.06  # more than by default, which helps with small markers
+    return aruco.ArucoDetector(aruco.Dictionary(family.bytesList[:1], 4, 0), parameters)
 
 
 _WITHIN = (-0.25, 0.0, 0.25)  # of a cell, where it is sampled
@@ -254,46 +198,63 @@ def _codes_of_negative(
 
 def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
     """Markers of each dictionary and border that has at least two within quadrangles (N, 4, 2)."""
-    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
-    framed = _is_framed(grey, H)
-    H, corners = H[framed], corners[framed]
-    for border in (1, 2):
-        for bits in sorted(set(DICTIONARIES.values())):
-            light, good = _cells(grey, H, bits, border)
-            if np.count_nonzero(good) < _FEWEST:
-                continue
-            which = np.flatnonzero(good)
-            for dictionary in USUAL:
-                if DICTIONARIES[dictionary] != bits:
-                    continue
-                number, turn = _matched(light[good], dictionary)
-                k = np.flatnonzero(number >= 0)
-                # The marker's first corner is that of the quadrangle to which the bits were turned.
-                placed = [np.roll(corners[which[j]], -turn[j], axis=0) for j in k.tolist()]
-                number, first = np.unique(number[k], return_index=True)
-                if len(number) >= _FEWEST:
-                    yield Marks(number, np.stack(placed)[first], dictionary), border
+    corners = corners[_is_framed(grey, corners)]
+    for border, bits in product((1, 2), sorted(set(DICTIONARIES.values()))):
+        which, light = _cells(grey, corners, bits, border)
+        for dictionary in USUAL if len(which) >= _FEWEST else ():
+            if DICTIONARIES[dictionary] == bits:
+                marks = _marks(corners[which], light, dictionary)
+                if len(marks) >= _FEWEST:
+                    yield marks, border
+
+
+def markers_in(
+    grey: NDArray[np.uint8], corners: Array, dictionary: str, border: int, first: int, count: int
+) -> Marks:
+    """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
+    corners = corners[_is_framed(grey, corners)]
+    which, light = _cells(grey, corners, DICTIONARIES[dictionary], border)
+    return _marks(corners[which], light, dictionary, first, count)
+
+
+def _marks(
+    corners: Array, light: NDArray[np.bool_], dictionary: str, first: int = 0, count: int | None = None
+) -> Marks:
+    """The markers within quadrangles (N, 4, 2), by their light cells.
+
+    Narrow windows of the threshold see a blurred border as a ring, which has an outline inside as well. So of
+    several quadrangles of one number, the largest is taken.
+    """
+    number, turn = _matched(light, dictionary, first, count)
+    k = np.flatnonzero(number >= 0)
+    k = k[np.argsort(-np.hypot(*np.moveaxis(corners[k] - np.roll(corners[k], 1, axis=1), 2, 0)).sum(axis=1))]
+    number, one = np.unique(number[k], return_index=True)
+    # The marker's first corner is that of the quadrangle to which the bits were turned.
+    order = (np.arange(4) + turn[k[one], None]) % 4
+    return Marks(number, np.take_along_axis(corners[k[one]], order[..., None], axis=1), dictionary)
 
 
 def numbers_in(
     light: NDArray[np.uint8] | Image, corners: Array, dictionary: str, border: int
 ) -> NDArray[np.int64]:
     """Numbers (N,) of the markers of a dictionary within quadrangles (N, 4, 2), clockwise; -1 for none."""
-    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
-    cells, good = _cells(light, H, DICTIONARIES[dictionary], border)
-    return np.where(good, _matched(cells, dictionary)[0], -1)
+    number = np.full(len(corners), -1)
+    which, cells = _cells(light, corners, DICTIONARIES[dictionary], border)
+    number[which] = _matched(cells, dictionary)[0]
+    return number
 
 
-def _is_framed(grey: NDArray[np.uint8], H: Array) -> NDArray[np.bool_]:
+def _is_framed(grey: NDArray[np.uint8], corners: Array) -> NDArray[np.bool_]:
     """Whether the rims (N,) of quadrangles are mostly dark, as those of markers of any code are."""
-    sampled = _sampled(grey, H, np.concatenate([_AROUND, _INSIDE]))
+    sampled = _sampled(grey, corners, np.concatenate([_AROUND, _INSIDE]))
     low, high = _levels(sampled)
     light = sampled[:, : len(_AROUND)] > 0.5 * (low + high)[:, None]
     return np.asarray((light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST))
 
 
-def _sampled(grey: NDArray[np.uint8] | Image, H: Array, places: Array) -> Array:
-    """Grey levels (N, K) at places (K, 2) of each quadrangle."""
+def _sampled(grey: NDArray[np.uint8] | Image, corners: Array, places: Array) -> Array:
+    """Grey levels (N, K) at places (K, 2) of each quadrangle (N, 4, 2)."""
+    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     return interpolate(grey, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
 
 
@@ -305,34 +266,38 @@ def _levels(grey: Array) -> tuple[Array, Array]:
 
 
 def _cells(
-    grey: NDArray[np.uint8] | Image, H: Array, bits: int, border: int
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Light cells (N, bits, bits) of codes, and (N,) whether the border is dark."""
-    side = bits + 2 * border
-    inner, good = np.zeros((len(H), bits, bits), dtype=np.bool_), np.ones(len(H), dtype=np.bool_)
+    grey: NDArray[np.uint8] | Image, corners: Array, bits: int, border: int
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Which M of quadrangles (N, 4, 2) have a dark border, and the light cells (M, bits, bits) in it."""
+    side, wide = bits + 2 * border, bits + 2 * border + 2 * _ROUNDS
+    which, inner = np.arange(len(corners)), np.zeros((len(corners), bits, bits), dtype=np.bool_)
     # A look at the middles of the cells leaves few.
     for within, most in (((0.0,), _ROUGHLY_WRONG), (_WITHIN, _WRONG_BORDER)):
         ticks = (np.arange(-_ROUNDS, side + _ROUNDS)[:, None] + 0.5 + np.array(within)).ravel() / side
         places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-        n, at, wide = len(within), np.flatnonzero(good), side + 2 * _ROUNDS
-        if not len(at):
+        if not len(which):
             break
-        level = _sampled(grey, H[at], places).reshape(len(at), wide, n, wide, n).mean(axis=(2, 4))
+        level = _sampled(grey, corners[which], places)
+        level = level.reshape(-1, wide, len(within), wide, len(within)).mean(axis=(2, 4))
+        low, high = _levels(level[:, _ROUNDS:-_ROUNDS, _ROUNDS:-_ROUNDS].reshape(len(level), -1))
         for _ in range(_ROUNDS):
             columns, rows = level[:, 1:-1], level[:, :, 1:-1]
             beside = columns[..., 2:] + columns[..., :-2] + rows[:, 2:] + rows[:, :-2]
             level = 2 * level[:, 1:-1, 1:-1] - 0.25 * beside
-        low, high = _levels(level.reshape(len(at), -1))
         light = level > 0.5 * (low + high)[:, None, None]
-        inner[at] = light[:, border:-border, border:-border]
-        wrong = light.sum(axis=(1, 2)) - inner[at].sum(axis=(1, 2))
-        good[at] = (wrong <= most * (side * side - bits * bits)) & (high - low > _CONTRAST)
-    return inner, good
+        inner = light[:, border:-border, border:-border]
+        wrong = light.sum(axis=(1, 2)) - inner.sum(axis=(1, 2))
+        good = (wrong <= most * (side * side - bits * bits)) & (high - low > _CONTRAST)
+        which, inner = which[good], inner[good]
+    return which, inner
 
 
-def _matched(light: NDArray[np.bool_], dictionary: str) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+def _matched(
+    light: NDArray[np.bool_], dictionary: str, first: int = 0, count: int | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Numbers (N,) of the markers of a dictionary with these light cells, -1 for none, and quarter turns."""
     known, most = _known_codes(dictionary)
+    known = known[first:][:count]
     turned = np.stack([np.rot90(light, turn, axes=(1, 2)) for turn in range(4)])
     signs = np.where(turned, np.float32(1), np.float32(-1)).reshape(4, len(light), known.shape[1])
     agree = signs @ known.T  # cells less twice the wrong ones
@@ -341,7 +306,7 @@ def _matched(light: NDArray[np.bool_], dictionary: str) -> tuple[NDArray[np.int6
     turn = agreed.argmax(axis=0)
     every = np.arange(len(light))
     close = agreed[turn, every] >= known.shape[1] - 2 * most
-    return np.where(close, nearest[turn, every], -1).astype(np.int64), turn
+    return np.where(close, first + nearest[turn, every], -1).astype(np.int64), turn
 
 
 @lru_cache
