@@ -305,7 +305,7 @@ def _steps(lin: Linearised, found: Estimate) -> Array:
 
 BIASED = Limit(2.0, 5.0)
 """Limits of a bias of the focal lengths and the centre, or of what is given or left out, over their std."""
-_UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
+_UNCLEAR = 5.0  # times the level: a weaker further cause is not told beside one that is too small to be told
 
 
 def explains(contest: Contest, contradiction: float, error: float) -> bool:
@@ -321,7 +321,7 @@ def explains(contest: Contest, contradiction: float, error: float) -> bool:
 
 
 def findings(contest: Contest, calibration: Calibration, given_told: bool) -> Iterator[Finding]:
-    """What the causes do to the camera; nothing about one that cannot be told from the target's shape.
+    """What the causes do to the camera.
 
     `given_told` tells whether a wrong given value is named already, by the values that the points have.
     """
@@ -331,17 +331,9 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
             continue
         if found.rival.of_board and estimated:
             continue  # the standard deviations include it
-        if not (found.rival.of_board or found.rival.of_given) and any(x.rival.of_board for x in close):
-            continue
         if place and any(x.rival.unknown for x in close):
             continue  # a further cause has to beat that of none as well
         names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
-        single = found.rival.patterns is None
-        if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
-            told = [x.rival.cause for x in close if x.evidence > LEVEL and not x.rival.unknown]
-            if place or not told:
-                continue
-            names = dict.fromkeys(told)
         grade, reason = _graded(contest, found, calibration)
         named = found.rival.steps is not None and not calibration.lens_choice
         if found.pattern == "all" and (found.rival.of_board or named):

@@ -27,7 +27,7 @@ from neurocal_cli.adjustment.cross_validation import (
     quietly,
     reduced,
 )
-from neurocal_cli.adjustment.free_networks import conditions_on_views, free_networks
+from neurocal_cli.adjustment.free_networks import conditions_on_views, variance_of_views
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.problem import normalised, problem_for
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
@@ -219,11 +219,6 @@ class Evidence:
         return self.calibration.rmse_px < ROUNDED * pixel_spread(self.points)
 
     @cached_property
-    def _networks(self) -> Array:
-        """(V,) squared error of a free network for each view."""
-        return free_networks(self.views, self.state)
-
-    @cached_property
     @quietly
     def held_out_px(self) -> float:
         """Five-fold cross-validation error; nan if no data can be left out."""
@@ -263,7 +258,7 @@ class Evidence:
         own_spare = self.views.n_equations - int(freedom.sum())
         if own_spare < SPARE[0] or freedom.sum() <= self.unknowns:
             return np.nan, np.nan
-        own = float(self._networks.sum()) / own_spare
+        own = variance_of_views(self.views, self.state)
         px = self.views.pixel_scale
         floor = (1e-9 * px) ** 2
         ratio = np.sqrt((self.variance + floor) / (own + floor))

@@ -136,9 +136,7 @@ class Linearised:
         left = np.empty((len(batches.view), 2, batches.local.shape[2]))
         for chunk, J, _ in _derivatives(self.views, self.state, self.middle, self.board, self.effects):
             left[chunk] = J[:, -1] - np.einsum("tc,tcin->tin", whole[batches.view[chunk]], J[:, :-1])
-        errors = np.swapaxes(left, 1, 2).reshape(-1, 2)
-        if len(errors) == len(self.views.index):
-            return errors
+        errors = np.swapaxes(left, 1, 2).reshape(-1, 2)  # with padding
         return errors[np.repeat(batches.first * left.shape[2], self.views.counts) + self.views.rank]
 
 

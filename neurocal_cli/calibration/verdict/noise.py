@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.common_noise import common_share, measured, with_common_share
 from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
@@ -42,7 +42,6 @@ _TAKEN_IN = 1e-2  # share of the error that is left
 # Between views or points whose sigma is too small and the others, and between the sigmas of such points.
 _FACTOR = 2.0
 _STATE = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
-_STEPS = 5  # to the minimum with equal weights
 
 
 def noise_shape(points: Correspondences, residuals: Array, alike: float) -> Iterator[Finding]:
@@ -91,7 +90,7 @@ def stated_noise(
     if covariance is None or measured(covariance):
         return []
     views = arrange(replace(points, covariance=None))
-    found = adjust(views.batches, normalised(state, views), free, free_poses, _STEPS).state
+    found = adjust(views.batches, normalised(state, views), free, free_poses, NEARBY).state
     errors = point_residuals(views, found)
     if not (errors**2).sum() > 0:
         return []

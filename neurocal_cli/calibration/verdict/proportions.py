@@ -7,9 +7,9 @@ board whose first axis is multiplied by s fulfil
     h_1 . omega h_2 = 0,    h_1 . omega h_1 = s^2 h_2 . omega h_2,    omega = A^-T A^-1,
 
 which is linear in omega for a given s. A camera is fitted to the board with the s whose equations have the
-smallest residual, and the rival of a stretched target refines it. It is the cause if the camera then fits
-nearly as well as a separate camera for each view, and far better than with the coordinates as they are given.
-A camera that leaves a large error, as to pixels that are clipped, explains nothing.
+smallest residual, and the rival of a stretched target refines it. It is the cause if the camera then fits far
+better than with the coordinates as they are given. A camera that leaves a large error, as to pixels that are
+clipped, explains nothing.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.verdict.findings import (
-    CONTRADICTION,
     DETERMINE,
     ERROR,
     EXPLAINED,
@@ -72,7 +70,7 @@ def proportions(points: Correspondences) -> Proportions | None:
         return None
     s *= _refined(found, axes)
     found = _fitted(points, axes[0], s)
-    if found is None or abs(np.log(s)) < STRETCHED_PRINT.poor or not _is_noise(found):
+    if found is None or abs(np.log(s)) < STRETCHED_PRINT.poor:
         return None
     # Boards that hardly differ in tilt may determine a camera only without skew, or from other starts.
     given = _fitted(points, axes[0], 1.0) or _fitted(points, axes[0], 1.0, skew=False)
@@ -157,10 +155,3 @@ def _rms(solution: Solution) -> float:
     points = solution.problem.points
     error = float(np.sqrt(solution.squared_error / len(points)))
     return error if error < float(points.pixels.std()) else np.inf
-
-
-def _is_noise(solution: Solution) -> bool:
-    """Whether a separate camera for each view would hardly lower the error."""
-    views, cost = solution.problem.views, float(solution.adjusted.cost.sum())
-    variance = cost / max(views.n_equations - 7 - 6 * views.n_views, 1)
-    return variance < CONTRADICTION.good**2 * variance_of_views(views, solution.state)

@@ -206,7 +206,7 @@ RIVALS: tuple[Rival, ...] = (
         "a target that is bent in one view",
         "the same in one view alone",
         f"leave this view out, or {_STIFF}",
-        words.bent_view,
+        words.plain("{view}: the target is bent in this view"),
         DISPLACED,
         effects.one_view,
         effect=effects.bends,
@@ -225,7 +225,10 @@ RIVALS: tuple[Rival, ...] = (
         "rays that do not meet in one point",
         "residuals around the centre that are others for near targets than for far ones",
         "photograph the target at the distances at which you measure",
-        words.no_pupil,
+        words.plain(
+            "near and far targets do not fit one camera, by {px} px rms, which {makes}: the rays do not meet "
+            "in one point, as in a wide lens, or behind a flat window under water"
+        ),
         DISPLACED,
         effects.common,
         effect=effects.no_pupil,

@@ -29,8 +29,11 @@ _SOME = 0.15  # share of the largest change of a given value from which on other
 
 
 def plain(text: str) -> Say:
-    """Words whose only amount is that of the displaced pixels."""
-    return lambda told: (text.format(px=f"{told.displaced:.2g}"), told.displaced / told.diagonal)
+    """Words with the displaced pixels, the first view that has it, and what it makes of the focal length."""
+    return lambda told: (
+        text.format(px=f"{told.displaced:.2g}", view=next(iter(told.members), ""), makes=_makes(told)),
+        told.displaced / told.diagonal,
+    )
 
 
 def changing(what: str) -> Say:
@@ -203,15 +206,6 @@ def deformed(told: Told) -> Said:
     return _on_board(told, f"a target of another shape, {shape}", "target")
 
 
-def no_pupil(told: Told) -> Said:
-    """Rays that meet the axis of the lens in other points."""
-    return (
-        f"near and far targets do not fit one camera, by {told.displaced:.2g} px rms, which {_makes(told)}: "
-        "the rays do not meet in one point, as in a wide lens, or behind a flat window under water",
-        told.displaced / told.diagonal,
-    )
-
-
 def _on_board(told: Told, shape: str, where: str = "board") -> Said:
     return (
         f"the residuals repeat on the {where} in all views: it seems {shape}, which {_makes(told)}",
@@ -221,11 +215,6 @@ def _on_board(told: Told, shape: str, where: str = "board") -> Said:
 
 def _makes(told: Told) -> str:
     return f"makes the focal length {percent(abs(told.longer))} too {'short' if told.longer > 0 else 'long'}"
-
-
-def bent_view(told: Told) -> Said:
-    """One view with a bent target."""
-    return f"{told.members[0]}: the target is bent in this view", told.displaced / told.diagonal
 
 
 def rolling(told: Told) -> Said:
@@ -257,10 +246,8 @@ def too_simple(model: str) -> Say:
     """A distortion model without coefficients that the lens needs."""
 
     def say(told: Told) -> Said:
-        left, longer, moved = np.sqrt(1.0 - told.found.explained), told.longer, 0.0
-        if np.isin((3, 4), told.lin.free).all():
-            by = told.found.camera[np.searchsorted(told.lin.free, (3, 4))]
-            moved = float(np.linalg.norm(by)) * told.lin.views.pixel_scale
+        left, longer, biases = np.sqrt(1.0 - told.found.explained), told.longer, told.biases
+        moved = float(np.hypot(biases.get("u0", 0.0), biases.get("v0", 0.0)))
         return (
             f"the distortion model is too simple: {model} lowers the error by {percent(1 - left)}, "
             f"makes the focal length {percent(abs(longer))} {'longer' if longer > 0 else 'shorter'}, and "
