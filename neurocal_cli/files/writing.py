@@ -52,7 +52,7 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     """
     data, outputs = _encode(content), held_back()
     if outputs is not None and str(path) in STDOUT_NAMES:
-        outputs.hold(data)
+        outputs.stdout.append(data)
     else:
         write_chunks(path, [data])
 
@@ -77,7 +77,7 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
         target = os.path.realpath(path)
         temporary = _written_beside(target, chunks, former)
         if outputs is not None:
-            outputs.stage(temporary, target, str(path))
+            outputs.staged.append((temporary, target, str(path)))
         else:
             os.replace(temporary, target)
 
@@ -158,13 +158,13 @@ def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outpu
     try:
         yield outputs
     except tuple(finishing):
-        _finish(outputs)
+        outputs.finish()
         raise
     except BaseException:
         outputs.discard()
         raise
     else:
-        _finish(outputs)
+        outputs.finish()
     finally:
         _CURRENT.reset(token)
 
@@ -178,10 +178,10 @@ class Outputs:
     """Inputs and pending outputs of a command."""
 
     def __init__(self) -> None:
-        self._inputs: set[_Identity] = set()
-        self._staged: list[tuple[str, str, str]] = []
+        self.inputs: set[_Identity] = set()
+        self.staged: list[tuple[str, str, str]] = []  # temporary files, their targets, and these as named
+        self.stdout: list[bytes] = []  # what is written there at the end
         self._folders: list[str] = []
-        self._stdout: list[bytes] = []
         self.read: dict[str, bytes] = {}  # stdin and pipes by their names, which can be read only once
         self.written: list[str] = []  # files that have got their contents, as they were named
 
@@ -194,16 +194,7 @@ class Outputs:
 
     def protect_status(self, status: os.stat_result) -> None:
         """Protect the file with this status from being overwritten."""
-        self._inputs.add((status.st_dev, status.st_ino))
-
-    def check(self, shown: str, former: os.stat_result | None) -> None:
-        """Refuse to overwrite an input, with a UsageError."""
-        if former is not None and (former.st_dev, former.st_ino) in self._inputs:
-            raise UsageError(f"{shown} is an input and would be overwritten; give another output")
-
-    def stage(self, temporary: str, target: str, name: str) -> None:
-        """Move a temporary file to its target, which the user calls by this name, at the end."""
-        self._staged.append((temporary, target, name))
+        self.inputs.add((status.st_dev, status.st_ino))
 
     def make_folder(self, folder: str) -> None:
         """Make a folder, and the folders that it is in; those that are new are removed again by `discard`."""
@@ -219,31 +210,31 @@ class Outputs:
             if not os.path.isdir(folder):  # another process may have made it meanwhile
                 raise
 
-    def hold(self, data: bytes) -> None:
-        """Write data to stdout at the end."""
-        self._stdout.append(data)
-
-    def commit(self) -> list[bytes]:
-        """Move all files to their targets, and return the data for stdout."""
-        with _undisturbed():
-            while self._staged:
-                temporary, target, name = self._staged[0]
-                os.replace(temporary, target)
-                del self._staged[0]
-                self.written.append(name)
-        self._folders = []
-        held, self._stdout = self._stdout, []
-        return held
+    def finish(self) -> None:
+        """Move all files to their targets, and write to stdout; a failure discards what is left."""
+        try:
+            with _undisturbed():
+                while self.staged:
+                    temporary, target, name = self.staged[0]
+                    os.replace(temporary, target)
+                    del self.staged[0]
+                    self.written.append(name)
+            self._folders = []
+            for data in self.stdout:
+                _write_stdout(data)
+        except BaseException:
+            self.discard()
+            raise
 
     def discard(self) -> None:
         """Remove the temporary files and the new folders, and leave the targets unchanged."""
-        for temporary, *_ in self._staged:
+        for temporary, *_ in self.staged:
             with suppress(OSError):
                 os.unlink(temporary)
         for folder in reversed(self._folders):
             with suppress(OSError):  # another program has put something into it
                 os.rmdir(folder)
-        self._staged, self._folders, self._stdout = [], [], []
+        self.staged, self._folders, self.stdout = [], [], []
 
 
 @contextmanager
@@ -258,15 +249,6 @@ def _undisturbed() -> Iterator[None]:
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
-
-
-def _finish(outputs: Outputs) -> None:
-    try:
-        for data in outputs.commit():
-            _write_stdout(data)
-    except BaseException:
-        outputs.discard()
-        raise
 
 
 @contextmanager
@@ -284,8 +266,9 @@ def _writing_failures(path: str | Path) -> Iterator[None]:
 
 def _check_place(path: str | Path, former: os.stat_result | None) -> None:
     """Refuse an input of the command, and a place where no file can be written."""
-    if outputs := held_back():
-        outputs.check(one_line(path), former)
+    outputs = held_back()
+    if outputs and former is not None and (former.st_dev, former.st_ino) in outputs.inputs:
+        raise UsageError(f"{one_line(path)} is an input and would be overwritten; give another output")
     folder = os.path.dirname(os.path.realpath(path))
     if str(path).endswith(os.sep) or (former is not None and stat.S_ISDIR(former.st_mode)):
         raise IsADirectoryError(errno.EISDIR, "is a folder")

@@ -7,13 +7,14 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
+from typing import NoReturn
 
 import pytest
 from support.command_line import run
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
-from neurocal_cli.files.writing import Outputs
+from neurocal_cli.files import writing
 
 
 @pytest.fixture(scope="module")
@@ -277,13 +278,13 @@ FOLDERS = {
 def test_an_interrupt_leaves_no_new_folder(
     made: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
 ) -> None:
-    def interrupt(outputs: Outputs) -> list[bytes]:
+    def interrupt() -> NoReturn:
         assert (made / "new").is_dir()
         raise KeyboardInterrupt
 
     monkeypatch.chdir(made)
     before = sorted(made.rglob("*"))
-    monkeypatch.setattr(Outputs, "commit", interrupt)
+    monkeypatch.setattr(writing, "_undisturbed", interrupt)
     result = run(*words)
     assert result.exit_code == 130
     assert result.stderr.endswith("Error: interrupted\n")
