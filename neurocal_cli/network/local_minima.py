@@ -117,7 +117,8 @@ def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
         return adjusted
     for _ in range(_FLIPS):
         second = second_poses(problem, adjusted)
-        turned = _flip_alone(problem, adjusted, second)
+        better = second.posed.cost < adjusted.cost[second.views] * (1 - 1e-9)
+        turned = _with_poses(problem, adjusted, second, better) if better.any() else None
         if turned is None:
             turned = _flip_with_camera(problem, adjusted, second)
         if turned is None:
@@ -148,12 +149,6 @@ def second_poses(problem: Problem, adjusted: Adjusted) -> SecondPoses:
         close &= (np.abs(posed.state.R - state.R[candidates]) > _SAME).any(axis=(1, 2))
         candidates, posed = candidates[close], posed.of_views(close)
     return SecondPoses(state, candidates, posed)
-
-
-def _flip_alone(problem: Problem, adjusted: Adjusted, second: SecondPoses) -> Adjusted | None:
-    """Flip all views whose mirrored pose fits better with the current camera; None if that is no better."""
-    better = second.posed.cost < adjusted.cost[second.views] * (1 - 1e-9)
-    return _with_poses(problem, adjusted, second, better) if better.any() else None
 
 
 def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: SecondPoses) -> Adjusted | None:

@@ -274,15 +274,11 @@ def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found
         place = _PLACES.get(adjusted.state.model, -2) + step
         if not 0 <= place < len(POLYNOMIAL_MODELS) or problem.type == 3:
             return None
-        fits.append(_adjusted_with(problem, adjusted, POLYNOMIAL_MODELS[place]))
+        other = problem.with_model(POLYNOMIAL_MODELS[place])
+        fits.append((other, other.adjust(adjusted.state.with_model(POLYNOMIAL_MODELS[place]))))
     return find_target(fits, flat, found.target, least=least)
 
 
 def richer_lens_is_better(found: Found) -> bool:
     """Whether one more distortion coefficient, with another target, explains the data decidedly better."""
     return _with_other_lens(found, 1, found.target.flat, found.evidence + LEVEL) is not None
-
-
-def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
-    new = problem.with_model(model)
-    return new, new.adjust(adjusted.state.with_model(model))

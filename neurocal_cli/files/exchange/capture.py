@@ -171,16 +171,13 @@ def dlt_coefficients(cameras: CameraSet) -> Array:
     return np.array(found).T
 
 
-def _dlt_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    rows = (",".join(map(repr, row)) for row in dlt_coefficients(cameras).tolist())
-    return {"": "\n".join([*rows, ""])}
-
-
 DLT = Format(
     "DLT",
     lenses="none",
     files="11 rows, written only",
-    texts=_dlt_text,
+    texts=lambda cameras, _: {
+        "": "".join(f"{','.join(map(repr, row))}\n" for row in dlt_coefficients(cameras).tolist())
+    },
     has_skew=True,
     poses=True,
     at_most=99,
