@@ -19,8 +19,8 @@ from typing import Any
 
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.exchange.document import Document, damaged
 from neurocal_cli.files.exchange.format_table import STILL, CameraSet, Format, PoseKeys, Tree, after, inverse
 from neurocal_cli.files.exchange.tree_paths import python_text, yaml_text
 from neurocal_cli.files.tree_fields import Field
@@ -222,12 +222,10 @@ _MRCAL_START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+
 
 
 def _mrcal_parts(document: Document) -> dict[str, Field]:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Python's of odd numbers
-            tree: Any = ast.literal_eval(document.text.strip())
-    except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
-        raise FormatError("is not a camera model of mrcal; write it again", document.source) from error
+    problem = "is not a camera model of mrcal; write it again"
+    with damaged(problem, document.source), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python's of odd numbers
+        tree: Any = ast.literal_eval(document.text.strip())
     if isinstance(tree, dict) and "rt_cam_ref" in tree:
         tree["extrinsics"] = tree["rt_cam_ref"]
     return {"camera": Field(tree, document.source)}

@@ -18,7 +18,7 @@ from typing import Any
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.document import Document, damaged
 from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after, to_quaternion
 from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.tree_fields import Field, is_number
@@ -156,15 +156,11 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
                 yield from take("7d") if known else ()
 
     reader = {"cameras": cameras, "images": images, "rigs": rigs}[name]
-    try:
+    with damaged(f"is a damaged {name}.bin of COLMAP; write it again", source):
         (count,) = take("Q")
         rows = [(k, [str(word) for word in reader()]) for k in range(1, count + 1)]
         if place != len(data):
             raise ValueError
-    except (struct.error, ValueError, OverflowError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"is a damaged {name}.bin of COLMAP; write it again", source) from error
     return rows
 
 
@@ -196,7 +192,7 @@ def _add_rig(folder: str, cameras: dict[int, Field], first: int) -> None:
     if len(rows) != 1:
         raise FormatError("holds several rigs; give a model with one", source)
     line, words = rows[0]
-    try:
+    with damaged("is not the line of a rig of these cameras; correct it", source, line):
         poses: dict[int, Tree] = {int(words[3]): {}}
         rest = words[4:]
         while rest:
@@ -208,10 +204,6 @@ def _add_rig(folder: str, cameras: dict[int, Field], first: int) -> None:
             raise FormatError(f"the reference of the rig must be the camera {first}", source, line)
         for one, camera in cameras.items():
             camera.value.update(poses[one])
-    except (ValueError, IndexError, KeyError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError("is not the line of a rig of these cameras; correct it", source, line) from error
 
 
 def _views_of(folder: str, camera: int) -> Tree:
@@ -219,11 +211,9 @@ def _views_of(folder: str, camera: int) -> Tree:
     rows, source = _file(folder, "images")
     poses = {}
     for k, words in rows or ():
-        try:
+        with damaged("is not the line of an image; correct it", source, k):
             if int(words[8]) == camera:
                 poses[words[9].strip()] = _seven_of(words[1:8])
-        except (ValueError, IndexError) as error:
-            raise FormatError("is not the line of an image; correct it", source, k) from error
     return poses
 
 

@@ -11,9 +11,12 @@ import io
 import json
 import os
 import re
+import struct
 import sys
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from tokenize import TokenError
 from typing import Any
@@ -21,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import FormatError, InputError, one_line
+from neurocal_cli.errors import FormatError, InputError, NeurocalError, one_line
 from neurocal_cli.files.camera_tree import parse_tree
 from neurocal_cli.files.exchange.mat_file import MARK, lists, read_variables
 from neurocal_cli.files.reading import decode, is_point_table, read_bytes
@@ -29,8 +32,8 @@ from neurocal_cli.files.tree_fields import Field, is_number
 
 # What NumPy's and Python's readers raise; the header of an array is an expression.
 _DAMAGED = (
-    ValueError, OSError, EOFError, KeyError, MemoryError, SyntaxError, TokenError, NotImplementedError,
-    zipfile.BadZipFile, zlib.error,
+    ValueError, LookupError, OverflowError, OSError, EOFError, MemoryError, RecursionError, SyntaxError,
+    TokenError, NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 PACKED = b"PK\x03\x04"  # how a ZIP archive begins, as which NumPy writes several arrays
 FROM_ZERO = (
@@ -73,6 +76,17 @@ _PRINTED = re.compile(r"\[\[[-+.\deE\s\[\]]+\]\]")
 def _with_commas(printed: re.Match[str]) -> str:
     rows = re.findall(r"\[\[?([^\[\]]+)\]", printed[0])
     return f" [{', '.join('[' + ', '.join(row.split()) + ']' for row in rows)}]"
+
+
+@contextmanager
+def damaged(problem: str, source: str, line: int | None = None) -> Iterator[None]:
+    """Turn what readers raise about damaged data into a FormatError; one about the data is passed on."""
+    try:
+        yield
+    except NeurocalError:
+        raise
+    except _DAMAGED as error:
+        raise FormatError(problem, source, line) from error
 
 
 class NoCameraError(InputError):
@@ -188,12 +202,8 @@ class Document:
     def array(self) -> np.ndarray[Any, Any] | None:
         """The array of an ``.npy`` file, or of a text of a few numbers; None for other files."""
         if self.data.startswith(b"\x93NUMPY"):
-            try:
+            with damaged("is no .npy file of numbers; save it again with numpy.save", self.source):
                 found = np.asarray(np.load(io.BytesIO(self.data), allow_pickle=False))
-            except _DAMAGED as error:
-                raise FormatError(
-                    "is no .npy file of numbers; save it again with numpy.save", self.source
-                ) from error
         else:
             rows = few_numbers(self.text)
             if rows is None:
@@ -251,7 +261,7 @@ def camera_matrix(rows: Any) -> Array | None:
 def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:
     """Read the arrays of an ``.npz`` file as nested lists; Python objects are left out, with a note."""
     tree: dict[str, Any] = {}
-    try:
+    with damaged("is not an .npz file; save it again with numpy.savez", source):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if not any(name.endswith(".npy") for name in archive.namelist()):
                 raise FormatError("is a ZIP archive without arrays of NumPy; unpack it first", source)
@@ -268,10 +278,6 @@ def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:
                         f"{source}: {name[:40]} holds Python objects, which can run code and are not read; "
                         "save it as an array of numbers"
                     )
-    except FormatError:
-        raise
-    except _DAMAGED as error:
-        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
     return _named(tree)
 
 
@@ -311,10 +317,8 @@ def sections(text: str, source: str) -> dict[str, Any]:
 def unpacked(data: bytes, source: str) -> bytes:
     """The contents of a file that gzip packed."""
     unpacker = zlib.decompressobj(31)
-    try:
+    with damaged("is a damaged .gz file; give it unpacked", source):
         found = unpacker.decompress(data, _MOST_BYTES)
-    except zlib.error as error:
-        raise FormatError("is a damaged .gz file; give it unpacked", source) from error
     if unpacker.unconsumed_tail or not unpacker.eof:
         raise FormatError("is cut off, or unpacks to more than 500 MB; give it unpacked", source)
     return found
