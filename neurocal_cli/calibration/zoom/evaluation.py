@@ -23,6 +23,7 @@ from neurocal_cli.adjustment.free_networks import variance_of_views
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.calibration.zoom.initialisation import poses_seen
+from neurocal_cli.calibration.zoom.open_terms import monomials, powers_up_to
 from neurocal_cli.calibration.zoom.parameter_networks import are_cameras, local_to_outputs, outputs_to_local
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
@@ -330,15 +331,3 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
     system = np.block([[kernel(nodes, nodes), plane], [plane.T, np.zeros((D + 1, D + 1))]])
     right = np.column_stack([kernel(x, nodes), np.ones(len(x)), x])
     return np.asarray(np.linalg.lstsq(system, right.T, rcond=None)[0][:S].T)
-
-
-def powers_up_to(nodes: Array, degree: int) -> Array:
-    """Powers of the controls (K, D) up to a total degree that the values of the settings (S, D) determine."""
-    most = [len(np.unique(column)) - 1 for column in nodes.T]
-    powers = np.array(list(product(*(range(min(limit, degree) + 1) for limit in most))))
-    return np.asarray(powers[powers.sum(axis=1) <= degree])
-
-
-def monomials(x: Array, powers: Array) -> Array:
-    """Products of powers (K, D) of the controls (n, D); (n, K)."""
-    return np.asarray(np.prod(x[:, None] ** powers, axis=2))

@@ -324,8 +324,8 @@ class PixelData:
         return np.swapaxes(C, 1, 2) @ N @ C * views.pixel_scale**2
 
 
-class LocalModel(Protocol):
-    """A model of the local parameters as functions of the controls: networks, polynomials."""
+class LinearisedModel(Protocol):
+    """What the normal equations of a `LocalModel` need."""
 
     @property
     def weights(self) -> Array:
@@ -335,14 +335,18 @@ class LocalModel(Protocol):
     def prior(self) -> Array:
         """(P,) precisions of the weights' priors about 0."""
 
+    def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Local parameters and their derivatives by the weights (n, L, P)."""
+
+
+class LocalModel(LinearisedModel, Protocol):
+    """A model of the local parameters as functions of the controls: networks, polynomials."""
+
     def moved(self: Model, step: Array) -> Model:
         """After a step (P,) of the weights."""
 
     def local(self, x: Array) -> Array:
         """(n, L) local parameters at scaled controls (n, D)."""
-
-    def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Local parameters and their derivatives by the weights (n, L, P)."""
 
 
 @frozen_dataclass(eq=False)
@@ -364,7 +368,7 @@ class QuadraticError:
         d, _ = self.offset(model.local(self.x), shared)
         return float(self.normal.at(d).sum() / self.variance + (model.prior * model.weights**2).sum())
 
-    def system(self, model: LocalModel, shared: Array) -> tuple[Array, Array]:
+    def system(self, model: LinearisedModel, shared: Array) -> tuple[Array, Array]:
         """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
         (local, J), prior = model.local_with_jacobian(self.x), model.prior
         pull = (self.normal.g - self.offset(local, shared)[1]) / self.variance

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.observability import MEANINGLESS
 from neurocal_cli.calibration.calibration import Calibration, Verdict, ViewResult
 from neurocal_cli.calibration.presented import Summarised
+from neurocal_cli.calibration.zoom.open_terms import OpenNets
 from neurocal_cli.calibration.zoom.parameter_networks import LensNets, are_cameras
 from neurocal_cli.calibration.zoom.settings import (
     Constants,
+    QuadraticError,
     Tables,
     coefficients_of,
     describe,
-    gauss_newton,
-    inverse,
     scaled_controls,
     with_scatter,
 )
@@ -154,17 +154,24 @@ class ZoomLens(Summarised):
 
     @cached_property
     def posteriors(self) -> tuple[Array, ...]:
-        """Covariance of each member's weights and constants."""
+        """Covariance of each member's weights, open terms and constants."""
         x = self.scaled(self.settings)
-        H = with_scatter(self.tables.normal, self.scatter, self.variance).S / self.variance
+        normal = with_scatter(self.tables.normal, self.scatter, self.variance)
+        error = QuadraticError(x, self.tables.local, normal, self.variance)
         found = []
-        for member in self.members:
-            _, J = member.nets.local_with_jacobian(x)
-            covariance = inverse(gauss_newton(J, H, member.nets.prior))
+        for nets in self._open:
+            covariance = nets.posterior(error)
             if self.target_coupling is not None:
+                _, J = nets.local_with_jacobian(x)
                 covariance = with_target_uncertain(covariance, J, self.target_coupling, self.variance)
             found.append(covariance)
         return tuple(found)
+
+    @property
+    def _open(self) -> list[OpenNets]:
+        """Each member's networks with their open terms."""
+        x = self.scaled(self.settings)
+        return [OpenNets.of(member.nets, x) for member in self.members]
 
     def setting_of(
         self, values: dict[str, float | None], extrapolate: bool = False
@@ -226,7 +233,7 @@ class ZoomLens(Summarised):
             outside the calibrated range.
         """
         x = self.scaled(self._numbers(settings, 2))
-        pairs = [member.nets.local_with_jacobian(x) for member in self.members]
+        pairs = [nets.local_with_jacobian(x) for nets in self._open]
         locals_ = np.array([local for local, _ in pairs])
         valid = are_cameras(locals_).all(axis=0)
         if not valid.all():

@@ -22,14 +22,13 @@ from neurocal_cli.calibration.zoom.evaluation import (
     baselines_of,
     evaluate_lens,
     grid_axes,
-    monomials,
-    powers_up_to,
     spline_matrix,
     thin_plate_matrix,
 )
 from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens_cameras
 from neurocal_cli.calibration.zoom.initialisation import _predicts_better
 from neurocal_cli.calibration.zoom.judgement import judge_lens
+from neurocal_cli.calibration.zoom.open_terms import monomials, powers_up_to
 from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
 from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens, camera_at
