@@ -294,11 +294,9 @@ def _check_fixed(name: str, value: float, fixed: Collection[str], type: int, ske
             "name fisheye or a model for ordinary lenses"
         )
     if name not in _SINGLE and not (model in _HOLDING and name in coefficient_names(model)):
-        names = ", ".join((*_SINGLE, *(coefficient_names(model) if model in _HOLDING else ())))
-        raise UsageError(
-            f"{name} cannot be fixed with the distortion model {model}, but {names} can; for coefficients "
-            f"name one of the models {', '.join(_HOLDING)}"
-        )
+        models = [one for one in _HOLDING if name in coefficient_names(one)]
+        told = f"it is a coefficient of {', '.join(models)}; name one of these distortion models"
+        raise UsageError(f"{name} cannot be fixed: {told if models else 'give one of ' + ', '.join(_SINGLE)}")
     least = 1 / _LARGEST if name.startswith("alpha") else -_LARGEST
     if (
         isinstance(value, bool)

@@ -64,8 +64,8 @@ class Estimation:
         for option in (option for option, is_given in of_camera.items() if is_given):
             if self.type == "3":
                 raise UsageError(f"--type 3 does not change the given camera; leave out {option}")
-            if self.skew == "auto" and option in angles:
-                raise UsageError(f"{option} is --skew fixed, but --skew is auto; give one of them")
+            if option in angles and (self.skew == "auto" or (self.skew == "free" and options.typed("skew"))):
+                raise UsageError(f"{option} is --skew fixed, but --skew is {self.skew}; give one of them")
         if self.square_pixels and self.distortion == "plumb-line":
             raise UsageError(
                 "--square-pixels does not go with --distortion plumb-line; name k1k2p1p2 instead"

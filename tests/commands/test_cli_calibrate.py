@@ -127,6 +127,7 @@ def test_the_name_and_the_image_size_are_written(points: Path, tmp_path: Path) -
         (["--fix", "u0=3", "--method", "linear"], "--fix needs --method neuro, but the method is linear"),
         (["--square-pixels", "--skew", "auto"], "--square-pixels is --skew fixed, but --skew is auto"),
         (["--fix", "theta=90", "--skew", "auto"], "--fix theta=90 is --skew fixed, but --skew is auto"),
+        (["--no-skew", "--skew", "free"], "--no-skew is --skew fixed, but --skew is free"),
         (["--square-pixels", "--distortion", "plumb-line"], "name k1k2p1p2 instead"),
         (["--fix", "k3=a"], "--fix k3=a: the value is no number"),
         (["--fix", "u0=1", "--fix", "u0=2"], "--fix gives u0 twice"),
