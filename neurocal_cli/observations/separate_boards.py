@@ -53,11 +53,12 @@ def boards_of(points: Correspondences) -> NDArray[np.str_]:
 
 def of_each_board(points: Correspondences) -> Iterator[Correspondences]:
     """The points of each board that `by_board` told apart; all points if it did not."""
-    boards = boards_of(points)
-    ids = np.full(len(points), "") if points.point is None else np.asarray(points.point).astype(str)
-    if not np.char.startswith(ids, np.char.add(boards, "/")).all():
-        boards[:] = ""
-    for board in np.unique(boards):
+    boards, ids = boards_of(points), points.point
+    apart = ids is not None and all(":" in name for name in points.view_names)
+    if not apart or not np.char.startswith(np.asarray(ids).astype(str), np.char.add(boards, "/")).all():
+        yield points
+        return
+    for board in dict.fromkeys(boards.tolist()):
         yield points.select(boards == board)
 
 
