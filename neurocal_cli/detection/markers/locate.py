@@ -35,6 +35,7 @@ from neurocal_cli.detection.markers.reading import (
     codes_in,
     looks_at,
     markers_in,
+    numbers_in,
 )
 from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
@@ -176,11 +177,11 @@ def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: Iterable[Array])
 def _check_border(plane: TagPlane, grey: NDArray[np.uint8], quadrangles: Iterable[Array]) -> None:
     """Refuse tags that are read with the other width of the border."""
     assert plane.markers is not None
-    name, first, count = plane.markers.dictionary, plane.markers.first_id, plane.tags[0] * plane.tags[1]
-    read = [markers_in(grey, every, name, 3 - plane.border, first, count) for every in quadrangles if name]
-    if len({number for marks in read for number in marks.number.tolist()}) >= _ENOUGH:
+    name, other = plane.markers.dictionary, 3 - plane.border
+    read = [numbers_in(grey, every, name, other) for every in quadrangles if name]
+    if len({number for one in read for number in one.tolist()} - {-1}) >= _ENOUGH:
         cells = "a border of one cell" if plane.border == 2 else "a border of two cells"
-        raise NoBoardError(f"the tags have {cells}; say border: {3 - plane.border} in a board file")
+        raise NoBoardError(f"the tags have {cells}; say border: {other} in a board file")
 
 
 def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[int, int]) -> Located:

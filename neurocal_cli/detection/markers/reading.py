@@ -198,9 +198,9 @@ def _codes_of_negative(
 
 def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
     """Markers of each dictionary and border that has at least two within quadrangles (N, 4, 2)."""
-    corners = corners[_is_framed(grey, corners)]
+    H, corners = _framed(grey, corners)
     for border, bits in product((1, 2), sorted(set(DICTIONARIES.values()))):
-        which, light = _cells(grey, corners, bits, border)
+        which, light = _cells(grey, H, bits, border)
         for dictionary in USUAL if len(which) >= _FEWEST else ():
             if DICTIONARIES[dictionary] == bits:
                 marks = _marks(corners[which], light, dictionary)
@@ -212,8 +212,8 @@ def markers_in(
     grey: NDArray[np.uint8], corners: Array, dictionary: str, border: int, first: int, count: int
 ) -> Marks:
     """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
-    corners = corners[_is_framed(grey, corners)]
-    which, light = _cells(grey, corners, DICTIONARIES[dictionary], border)
+    H, corners = _framed(grey, corners)
+    which, light = _cells(grey, H, DICTIONARIES[dictionary], border, _ROUGHLY_WRONG)
     return _marks(corners[which], light, dictionary, first, count)
 
 
@@ -222,12 +222,13 @@ def _marks(
 ) -> Marks:
     """The markers within quadrangles (N, 4, 2), by their light cells.
 
-    Narrow windows of the threshold see a blurred border as a ring, which has an outline inside as well. So of
-    several quadrangles of one number, the largest is taken.
+    Narrow windows of the threshold see a blurred border as a ring, which has an outline inside as well. So
+    of several quadrangles of one number, the largest of those that fit it best is taken.
     """
-    number, turn = _matched(light, dictionary, first, count)
+    number, turn, agreed = _matched(light, dictionary, first, count)
+    around = np.hypot(*np.moveaxis(corners - np.roll(corners, 1, axis=1), 2, 0)).sum(axis=1)
     k = np.flatnonzero(number >= 0)
-    k = k[np.argsort(-np.hypot(*np.moveaxis(corners[k] - np.roll(corners[k], 1, axis=1), 2, 0)).sum(axis=1))]
+    k = k[np.lexsort((-around[k], -agreed[k]))]
     number, one = np.unique(number[k], return_index=True)
     # The marker's first corner is that of the quadrangle to which the bits were turned.
     order = (np.arange(4) + turn[k[one], None]) % 4
@@ -239,22 +240,24 @@ def numbers_in(
 ) -> NDArray[np.int64]:
     """Numbers (N,) of the markers of a dictionary within quadrangles (N, 4, 2), clockwise; -1 for none."""
     number = np.full(len(corners), -1)
-    which, cells = _cells(light, corners, DICTIONARIES[dictionary], border)
+    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    which, cells = _cells(light, H, DICTIONARIES[dictionary], border)
     number[which] = _matched(cells, dictionary)[0]
     return number
 
 
-def _is_framed(grey: NDArray[np.uint8], corners: Array) -> NDArray[np.bool_]:
-    """Whether the rims (N,) of quadrangles are mostly dark, as those of markers of any code are."""
-    sampled = _sampled(grey, corners, np.concatenate([_AROUND, _INSIDE]))
+def _framed(grey: NDArray[np.uint8], corners: Array) -> tuple[Array, Array]:
+    """Homographies (M, 3, 3) and corners of the quadrangles whose rims are mostly dark, as markers' are."""
+    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    sampled = _sampled(grey, H, np.concatenate([_AROUND, _INSIDE]))
     low, high = _levels(sampled)
     light = sampled[:, : len(_AROUND)] > 0.5 * (low + high)[:, None]
-    return np.asarray((light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST))
+    framed = (light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST)
+    return H[framed], corners[framed]
 
 
-def _sampled(grey: NDArray[np.uint8] | Image, corners: Array, places: Array) -> Array:
-    """Grey levels (N, K) at places (K, 2) of each quadrangle (N, 4, 2)."""
-    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+def _sampled(grey: NDArray[np.uint8] | Image, H: Array, places: Array) -> Array:
+    """Grey levels (N, K) at places (K, 2) of each quadrangle."""
     return interpolate(grey, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
 
 
@@ -266,21 +269,20 @@ def _levels(grey: Array) -> tuple[Array, Array]:
 
 
 def _cells(
-    grey: NDArray[np.uint8] | Image, corners: Array, bits: int, border: int
+    grey: NDArray[np.uint8] | Image, H: Array, bits: int, border: int, wrong_border: float = _WRONG_BORDER
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Which M of quadrangles (N, 4, 2) have a dark border, and the light cells (M, bits, bits) in it."""
-    side, wide = bits + 2 * border, bits + 2 * border + 2 * _ROUNDS
-    which, inner = np.arange(len(corners)), np.zeros((len(corners), bits, bits), dtype=np.bool_)
+    """Which M of N quadrangles have a dark border, and the light cells (M, bits, bits) in it."""
+    side, which, inner = bits + 2 * border, np.arange(len(H)), np.zeros((len(H), bits, bits), dtype=np.bool_)
     # A look at the middles of the cells leaves few.
-    for within, most in (((0.0,), _ROUGHLY_WRONG), (_WITHIN, _WRONG_BORDER)):
-        ticks = (np.arange(-_ROUNDS, side + _ROUNDS)[:, None] + 0.5 + np.array(within)).ravel() / side
+    for within, rounds, most in (((0.0,), 1, _ROUGHLY_WRONG), (_WITHIN, _ROUNDS, wrong_border)):
+        ticks = (np.arange(-rounds, side + rounds)[:, None] + 0.5 + np.array(within)).ravel() / side
         places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         if not len(which):
             break
-        level = _sampled(grey, corners[which], places)
-        level = level.reshape(-1, wide, len(within), wide, len(within)).mean(axis=(2, 4))
-        low, high = _levels(level[:, _ROUNDS:-_ROUNDS, _ROUNDS:-_ROUNDS].reshape(len(level), -1))
-        for _ in range(_ROUNDS):
+        every = len(which), side + 2 * rounds, len(within), side + 2 * rounds, len(within)
+        level = _sampled(grey, H[which], places).reshape(every).mean(axis=(2, 4))
+        low, high = _levels(level[:, rounds:-rounds, rounds:-rounds].reshape(len(which), -1))
+        for _ in range(rounds):
             columns, rows = level[:, 1:-1], level[:, :, 1:-1]
             beside = columns[..., 2:] + columns[..., :-2] + rows[:, 2:] + rows[:, :-2]
             level = 2 * level[:, 1:-1, 1:-1] - 0.25 * beside
@@ -294,8 +296,11 @@ def _cells(
 
 def _matched(
     light: NDArray[np.bool_], dictionary: str, first: int = 0, count: int | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Numbers (N,) of the markers of a dictionary with these light cells, -1 for none, and quarter turns."""
+) -> tuple[NDArray[np.int64], NDArray[np.intp], NDArray[np.float32]]:
+    """Numbers (N,) of the markers of a dictionary with these light cells, -1 for none, and quarter turns.
+
+    Also how many cells agree less those that do not.
+    """
     known, most = _known_codes(dictionary)
     known = known[first:][:count]
     turned = np.stack([np.rot90(light, turn, axes=(1, 2)) for turn in range(4)])
@@ -305,8 +310,9 @@ def _matched(
     agreed = np.take_along_axis(agree, nearest[..., None], axis=2)[..., 0]
     turn = agreed.argmax(axis=0)
     every = np.arange(len(light))
-    close = agreed[turn, every] >= known.shape[1] - 2 * most
-    return np.where(close, first + nearest[turn, every], -1).astype(np.int64), turn
+    agreed = agreed[turn, every]
+    close = agreed >= known.shape[1] - 2 * most
+    return np.where(close, first + nearest[turn, every], -1).astype(np.int64), turn, agreed
 
 
 @lru_cache
