@@ -429,13 +429,12 @@ def _shifted(
     known = np.zeros(high - low + 1, dtype=bool)
     known[tuple((places - low).T)] = True
     # One of two places is on the board.
-    for shift in np.unique(np.concatenate([places - index[0], places - index[1]]), axis=0):
-        shifted = index + shift
-        inside = ((shifted >= low) & (shifted <= high)).all(axis=1)
-        if np.count_nonzero(inside) >= len(index) - 1:
-            inside[inside] = known[tuple((shifted[inside] - low).T)]
-            if np.count_nonzero(inside) >= len(index) - 1:
-                yield shifted, ~inside
+    shifts = np.unique(np.concatenate([places - index[0], places - index[1]]), axis=0)
+    shifted = index + shifts[:, None]
+    inside = ((shifted >= low) & (shifted <= high)).all(axis=2)
+    inside[inside] = known[tuple((shifted[inside] - low).T)]
+    for k in np.flatnonzero(np.count_nonzero(inside, axis=1) >= len(index) - 1).tolist():
+        yield shifted[k], ~inside[k]
 
 
 def _are_turns(plane: CirclePlane, names: list[NDArray[np.int64]]) -> bool:

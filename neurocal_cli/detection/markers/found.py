@@ -254,7 +254,7 @@ _USUAL, _SIMPLE = 20, 12  # denominators of usual ratios, and the largest one of
 _CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.012
 _CLOSE_ROUGH = 0.015  # of one from the corners of the markers
 _DIGITS = 3  # of other ratios
-_SHRUNK = (1.0, 0.96, 0.92, 0.88, 0.84, 0.8)  # sides of tags that are tried, over those that were read
+_SHRUNK = (0.92, 0.88, 0.96, 1.0, 0.84, 0.8)  # sides of tags that are tried, over those that were read
 _LEAST = 0.04  # spacing
 _ALONG = np.linspace(0.35, 0.65, 7)  # of a cell's side, where the light is looked at
 _ACROSS = np.linspace(-0.15, 0.5, 53)  # of a cell, from its side inwards
@@ -308,6 +308,8 @@ def _best(plane: TagPlane, image: NDArray[np.generic], marks: Marks) -> tuple[fl
         count = 0 if part is None else int(np.isfinite(part[0][..., 0]).sum())
         if part is not None and count > most:
             best, most = (spacing, part), count
+        if most == plane.cols * plane.rows:
+            break
     return best
 
 

@@ -195,7 +195,7 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
         found[tuple(at[good].T)], contrast[tuple(at[good].T)] = new[good], size[good]
         leave_out_strays(ground, found, contrast, flattening)
         seen = np.isfinite(contrast)
-        if seen.sum() < _FEWEST or seen.sum() <= count:
+        if seen.sum() < _FEWEST or seen.sum() <= count or seen.all():
             break
         count = int(seen.sum())
         # Vertices that were too far from the markers may be near the new ones.

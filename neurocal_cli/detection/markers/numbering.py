@@ -197,7 +197,8 @@ def numbered(lies: Sequence[Lie]) -> Numbering | None:
     for lie in lies:
         mine: dict[tuple[int, bool], tuple[int, _Way]] = {}
         for way in _ways(lie.tags):
-            count = int(np.unique(_offsets(lie, way), return_counts=True)[1].max())
+            offsets = _offsets(lie, way)
+            count = int(np.bincount(offsets - offsets.min()).max())
             key = way.cols, _is_as_text(way)
             if count > mine.get(key, (0, way))[0]:
                 mine[key] = count, way
