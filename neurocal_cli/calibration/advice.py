@@ -179,11 +179,7 @@ def candidates(calibration: Calibration) -> list[Candidate]:
             depth = camera.A[0, 0] * float(extent.max()) / (width * size[0])
             centre = depth * ray / ray[2]
             points = checked @ np.swapaxes(R, 1, 2) + centre  # (turns, n, 3)
-            pixels = camera.project(points)[0]
-            with np.errstate(invalid="ignore"):
-                inside = ((pixels >= 0) & (pixels <= size - 1)).all(axis=(1, 2))
-                whole = inside & camera.sees(points).all(axis=1)
-            for k in np.flatnonzero(whole).tolist():
+            for k in np.flatnonzero(camera.shows(points).all(axis=1)).tolist():
                 pose = Pose(R[k], centre - R[k] @ middle)
                 outline = camera.project(corners @ R[k].T + centre)[0]
                 found.append(Candidate(pose, np.array(share), width, *turns[k], outline))

@@ -119,6 +119,14 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray((Z > 0) & is_monotonic(self.distortion, X / Z, Y / Z))
 
+    def shows(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (..., 3) are in the image, as far as its size is known; see `sees`."""
+        seen = self.sees(points)
+        if self.image_size is None:
+            return seen
+        pixels = self.project(points)[0]
+        return seen & ((pixels >= -0.5) & (pixels <= np.array(self.image_size) - 0.5)).all(axis=-1)
+
     def project_jacobian(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of the pixels of points (N, 3).
 

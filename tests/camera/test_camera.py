@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,15 @@ def test_points_behind_and_beyond_are_told() -> None:
     assert in_front.tolist() == [True, False, False, True]
     assert np.isfinite(pixels).all(axis=1).tolist() == [True, False, False, True]
     assert camera.sees(points).tolist() == [True, False, False, False]
+
+
+def test_an_image_shows_what_is_within_its_outermost_pixels() -> None:
+    camera = Camera(Intrinsics(100.0, 100.0, 50.0, 40.0), Distortion(), (100, 80))
+    u = np.array([-0.6, -0.4, 50.0, 99.4, 99.6])
+    points = np.column_stack([(u - 50.0) / 100.0, np.zeros(5), np.ones(5)])
+    assert camera.shows(points).tolist() == [False, True, True, True, False]
+    assert not camera.shows(-points).any()
+    assert replace(camera, image_size=None).shows(points).all()
 
 
 @pytest.mark.parametrize(

@@ -150,12 +150,7 @@ class _Pair:
 
     def _shown(self, which: int, in_rig: Array) -> NDArray[np.bool_]:
         """(N,) which points (N, 3) in the rig are in the image of the first or the second camera."""
-        camera, points = self.cameras[which].camera, self.poses[which].to_camera(in_rig)
-        assert camera.image_size is not None
-        pixels, fine = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels >= 0) & (pixels <= np.array(camera.image_size) - 1)).all(axis=1)
-        return np.asarray(inside & fine & camera.sees(points))
+        return self.cameras[which].camera.shows(self.poses[which].to_camera(in_rig))
 
     def _is_seen(self, view: Candidate) -> bool:
         in_rig = self._in_rig(view)

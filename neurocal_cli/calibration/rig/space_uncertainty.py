@@ -158,7 +158,9 @@ def errors_at(rig: Rig, distance: float) -> PlaneErrors:
     with np.errstate(invalid="ignore"):
         rays = rays[rays[:, 2] > 0]  # nan too
     points = distance * rays / rays[:, 2:]
-    seen = np.stack([_seen_by(rig, name, points) for name in rig.cameras])
+    seen = np.stack(
+        [one.camera.shows(rig.poses[name].to_camera(points)) for name, one in rig.cameras.items()]
+    )
     seen[:, seen.sum(axis=0) < 2] = False
     common = seen[0]
     if common.sum() < 3:
@@ -185,16 +187,6 @@ def errors_at(rig: Rig, distance: float) -> PlaneErrors:
     worst = max(of_points, key=lambda one: one.std)
     sigma = float(np.sqrt(variance))
     return PlaneErrors(distance, sigma, length, of_length, of_points[middle], worst, of_depth)
-
-
-def _seen_by(rig: Rig, name: str, points: Array) -> NDArray[np.bool_]:
-    """(N,) whether a camera has points of the first camera's frame in its image."""
-    camera = rig.cameras[name].camera
-    pixels, seen = camera.project(rig.poses[name].to_camera(points))
-    if camera.image_size is None:
-        return np.asarray(seen)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(seen & ((pixels >= -1) & (pixels <= camera.image_size)).all(axis=1))
 
 
 def _places(points: Array) -> tuple[int, tuple[int, int]]:
