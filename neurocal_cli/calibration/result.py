@@ -21,7 +21,7 @@ from neurocal_cli.adjustment.observability import refuse_undetermined
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.given_model import undetermined_coefficients
 from neurocal_cli.camera.geometry import Array
@@ -168,11 +168,17 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
         std = with_scale(
             pose_std(R, centre, views.scale, cov.own), t, std_of_scale(problem.points, solution.target)
         )
+    return view_results(views, R, t, std, squared, not problem.free_poses)
+
+
+def view_results(
+    views: Views, R: Array, t: Array, std: Array, squared: Array, given: bool = False
+) -> dict[str, ViewResult]:
+    """Poses in world units, their std (V, 6), and the reprojection error by the points' squared ones (N,)."""
     rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
     R.setflags(write=False)
     t.setflags(write=False)
     rows = zip(views.names, R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
-    given = not problem.free_poses
     return {
         name: ViewResult(Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, given)
         for name, R_k, t_k, sigma, n, r in rows

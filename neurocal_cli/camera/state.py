@@ -54,15 +54,16 @@ class CameraState:
 
     def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
+        R, t = rotation_step(by_pose[:, :3]) @ self.R, self.t + by_pose[:, 3:]
+        return replace(self.changed(by_camera), R=R, t=t)
+
+    def changed(self, by_camera: Array) -> CameraState:
+        """The state after a step of the camera (1 or V, 5 + K)."""
         by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
         if self.model in WITH_XI:
             by_entries = by_entries + self._along_valley(by_entries, by_k)
-        return replace(
-            self.with_entries(self.entries + by_entries),
-            R=rotation_step(by_pose[:, :3]) @ self.R,
-            t=self.t + by_pose[:, 3:],
-            k=self.k + (by_k[0] if self.k.ndim == 1 else by_k),
-        )
+        k = self.k + (by_k[0] if self.k.ndim == 1 else by_k)
+        return replace(self.with_entries(self.entries + by_entries), k=k)
 
     def with_entries(self, entries: Array) -> CameraState:
         """The state with other entries of A; those of square pixels stay square."""

@@ -108,9 +108,7 @@ class RigState:
         """The state after a step: shared (columns.n_shared,), own (V, 6)."""
         columns = self.columns
         cameras = tuple(
-            replace(
-                camera.with_entries(camera.entries + shared[None, place[:5]]), k=camera.k + shared[place[5:]]
-            )
+            camera.changed(shared[None, place])
             for camera, place in zip(self.cameras, columns.cameras, strict=True)
         )
         steps = np.zeros((len(cameras), 6))

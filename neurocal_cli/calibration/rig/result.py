@@ -20,6 +20,7 @@ from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import told_of_fold, where_not_monotonic
+from neurocal_cli.calibration.result import view_results
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.rig import Rig, named_std
 from neurocal_cli.camera.distortion import Distortion
@@ -96,16 +97,9 @@ def _calibration(fit: RigFit, found: Covariance, side: int, squares: Array, scal
     changes: dict[str, Any] = {}
     if fit.free[fit.state.columns.cameras[side]].any():
         changes = _intrinsic_changes(fit, found, side, intrinsics)
-    rms = np.sqrt(np.add.reduceat(squares, views.first) / views.counts)
     R, t = problem.world_poses(fit.state, side)
     stds = with_scale(_pose_stds(fit, found, side, R), t, scale_std)
-    R.setflags(write=False)
-    t.setflags(write=False)
-    results = {
-        name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
-                         int(views.counts[k]), float(rms[k]))
-        for k, name in enumerate(views.names)
-    }  # fmt: skip
+    results = view_results(views, R, t, stds, squares)
     rmse = float(np.sqrt(squares.mean()))
     return replace(
         given,
