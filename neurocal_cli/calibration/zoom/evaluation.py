@@ -39,7 +39,7 @@ from neurocal_cli.calibration.zoom.target import on_target
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.errors import InputError, NeurocalError
+from neurocal_cli.errors import InputError
 
 _HIGHEST_DEGREE = 6
 
@@ -86,7 +86,9 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
     prediction = lens.predict(points.settings)
     local, constants = prediction.local, prediction.constants
     if not lens.still:
-        constants = _poses(lens, points, local, constants.theta)
+        everywhere = np.ones(len(local), dtype=bool)
+        R, t = poses_seen(points, everywhere, lens.model, local, constants.theta)
+        constants = replace(constants, R=R, t=t)
     squares = _squares(lens, points, local, constants)
     setting = points.point_setting
     behind = int(np.isnan(squares).sum())
@@ -136,22 +138,6 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
             f"first at {first}: the networks extrapolate there"
         )
     return matched, warnings
-
-
-def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Constants:
-    """Pose of each view with known cameras (type 3)."""
-    V = points.points.n_views
-    R, t = np.full((V, 3, 3), np.nan), np.full((V, 3), np.nan)
-    number = {name: k for k, name in enumerate(points.points.view_names)}
-    for s, values in enumerate(local):
-        try:
-            poses = poses_seen(points, s, lens.model, values, theta)
-        except NeurocalError as error:
-            where = describe(points.controls, points.settings[s])
-            raise InputError(f"at {where}: {error}") from error
-        for name, pose in poses.items():
-            R[number[name]], t[number[name]] = pose.R, pose.t
-    return Constants(theta, R, t)
 
 
 def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Constants) -> Array:

@@ -10,7 +10,6 @@ error no richer one lowers.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from typing import cast
@@ -39,7 +38,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
@@ -166,14 +165,13 @@ def _completed(data: PixelData, static: StaticFit, progress: Progress | None) ->
     own = np.diagonal(local_covariance(table.normal, L, known.variance), axis1=1, axis2=2)[nearest]
     local, precision = static.local.copy(), np.zeros_like(static.local)
     local[~good], precision[~good] = predicted, known.variance / ((predicted - donor) ** 2 + own)
-    R, t = static.R.copy(), static.t.copy()
-    number = {name: k for k, name in enumerate(data.lens.points.view_names)}
-    theta = table.constants.theta
-    for s in np.flatnonzero(~good).tolist():
-        with suppress(NeurocalError):
-            for name, pose in poses_seen(data.lens, s, data.model, local[s], theta).items():
-                R[number[name]], t[number[name]] = pose.R, pose.t
-    return replace(static, local=local, R=R, t=t, precision=precision)
+    static = replace(static, local=local, precision=precision)
+    if data.still:
+        return static
+    R, t = poses_seen(data.lens, ~good, data.model, local, table.constants.theta)
+    known_before = good[data.setting]
+    R[known_before], t[known_before] = static.R[known_before], static.t[known_before]
+    return replace(static, R=R, t=t)
 
 
 def _predicted(start: CalibratedSettings, x: Array, part: NDArray[np.bool_], to: Array, seed: int) -> Array:
@@ -184,15 +182,36 @@ def _predicted(start: CalibratedSettings, x: Array, part: NDArray[np.bool_], to:
     return np.asarray(np.mean([nets.local(to) for nets in members], axis=0))
 
 
-def poses_seen(lens: LensPoints, s: int, model: str, local: Array, theta: float) -> dict[str, Pose]:
-    """Pose of each view of a setting with a known camera (type 3)."""
-    camera = Camera(
-        Intrinsics(local[0], local[1], local[2], local[3], theta),
-        Distortion(model, coefficients_of(local, model)),
-    )
-    points = lens.points.select(lens.point_setting == s)
-    fit = calibrate(points, type=3, intrinsics=camera, distortion="none", outliers="keep", target="given")
-    return {name: view.pose for name, view in fit.views.items()}
+def poses_seen(
+    lens: LensPoints, some: NDArray[np.bool_], model: str, local: Array, theta: float
+) -> tuple[Array, Array]:
+    """Poses of the views (V, 3, 3) and (V, 3) of some settings with known cameras (type 3); nan elsewhere.
+
+    `some` (S,) tells which settings.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        A setting whose points do not determine the poses of its views.
+    """
+    V = lens.points.n_views
+    R, t = np.full((V, 3, 3), np.nan), np.full((V, 3), np.nan)
+    number = {name: k for k, name in enumerate(lens.points.view_names)}
+    for s in np.flatnonzero(some).tolist():
+        lens_there = Distortion(model, coefficients_of(local[s], model))
+        alpha_u, alpha_v, u0, v0 = local[s, :4]
+        camera = Camera(Intrinsics(alpha_u, alpha_v, u0, v0, theta), lens_there)
+        seen = lens.points.select(lens.point_setting == s)
+        try:
+            fit = calibrate(
+                seen, type=3, intrinsics=camera, distortion="none", outliers="keep", target="given"
+            )
+        except NeurocalError as error:
+            where = describe(lens.controls, lens.settings[s])
+            raise DegenerateGeometryError(f"at {where}: {error}; or leave this setting out") from error
+        for name, view in fit.views.items():
+            R[number[name]], t[number[name]] = view.pose.R, view.pose.t
+    return R, t
 
 
 def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:

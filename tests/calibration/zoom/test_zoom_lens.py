@@ -291,6 +291,16 @@ def test_a_setting_with_one_view_is_never_left_out(views: tuple[int, ...], seed:
     assert np.abs(away).max() < 4
 
 
+def test_a_setting_without_poses_is_named() -> None:
+    """Its one view shows one row of the board, which no camera determines a pose from."""
+    points, _ = zooming(lambda z: [-0.1, 0.0, 0.0, 0.0], (4, 4, 1, 4), 0)
+    of_one = points.point_setting == 2
+    row = ~of_one | (points.points.world[:, 1] == 0.0)
+    few = LensPoints.grouped(points.points.select(row), {"zoom": points.columns["zoom"][row]})
+    with pytest.raises(DegenerateGeometryError, match=r"at zoom 54\.66.*; or leave this setting out"):
+        fit_lens(few, distortion="k1", skew=False, target="given", topologies=((0, 0),))
+
+
 def zooming(
     k: Callable[[float], list[float]], views: Sequence[int] = (5,) * 12, seed: int = 5
 ) -> tuple[LensPoints, dict[float, float]]:
