@@ -90,11 +90,15 @@ class Contest:
     def instead_of_target(self, worth: float = 1.0) -> float:
         """Log odds of causes other than the target's shape, known or not; 0 if there are none.
 
-        The level by which they have to beat the target's shape is taken off; a given value, which the shape
-        takes in, comes first if it is hardly less probable. An equation is `worth` so much for that shape.
+        A cause that cannot be told from the target's shape says nothing against it. The level by which the
+        others have to beat that shape is taken off; a given value, which the shape takes in, comes first if
+        it is hardly less probable. An equation is `worth` so much for that shape.
         """
         first = self.causes[0] if self.causes else None
         if first is None:
+            return 0.0
+        own = first.rival
+        if not (own.of_board or own.of_given) and any(x.rival.of_board for x in self.close[0]):
             return 0.0
         if first.rival.effect in OF_POSES:  # the target takes in what is wrong with given poses
             return _FAR_MORE * worth * self.evidence
