@@ -139,7 +139,8 @@ _HOMES = {
     "write_rig": "files.result_files",
 }
 
-__all__ = list(_HOMES)
+if not TYPE_CHECKING:  # type checkers read no list that is computed, and take all imports above
+    __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
@@ -156,7 +157,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted(_HOMES)
 
 
 class _Names(dict[str, Any]):

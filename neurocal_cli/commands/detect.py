@@ -165,6 +165,10 @@ def detect(
       neurocal detect print.png --board charuco:8x6:28:21 -o points.csv
       neurocal detect print.png --board charuco:8x6:28:21 --board-name A -o a.csv
     """  # noqa: D301 - as in the group
+    from neurocal_cli.observations.separate_boards import check_board_name, of_one_board
+
+    if board_name is not None:
+        check_board_name(board_name)
     preparation.check_one_stdin(*images, board.file)
     preparation.check_summary(as_json, output)
     if watch is not None:
@@ -184,7 +188,6 @@ def detect(
     from neurocal_cli.files.board_yaml import board_line, format_board
     from neurocal_cli.files.points_csv import format_points
     from neurocal_cli.observations.points import Correspondences
-    from neurocal_cli.observations.separate_boards import of_one_board
 
     if save_board is not None:
         write_whole(save_board, format_board(target))

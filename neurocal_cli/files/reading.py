@@ -126,9 +126,12 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         even, odd = head[::2].count(0), head[1::2].count(0)
         if max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0:
             raise FormatError("is UTF-16 text; save it as UTF-8", source)
-        if data.startswith(_IMAGES):
+        from neurocal_cli.files.image_files import VIDEO, other_kind
+
+        what = "an image" if data.startswith(_IMAGES) else "a video" if other_kind(data) == VIDEO else ""
+        if what:
             advice = f"find its points first: {detect_line(source)}" if "points" in kind else f"give {kind}"
-            raise FormatError(f"is an image, not {kind}", source, advice=advice)
+            raise FormatError(f"is {what}, not {kind}", source, advice=advice)
         raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
     try:
         return data.decode("utf-8-sig")

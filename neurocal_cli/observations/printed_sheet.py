@@ -130,7 +130,8 @@ def paper_size(name: str) -> tuple[float, float]:
     if match and all(20 <= float(side) <= 5000 for side in match.groups()):
         return float(match[1]), float(match[2])
     raise UsageError(
-        f"the paper {name[:20]!r} is not known; use {', '.join(PAPERS)}, or its size in mm such as 420x297"
+        f"the paper {name[:20]!r} is not known; use {', '.join(PAPERS)}, or its size in mm such as 420x297, "
+        "each from 20 to 5000"
     )
 
 

@@ -20,19 +20,21 @@ from neurocal_cli.observations.points import Correspondences
 _BESIDE = 1.5  # distance of boards that are set beside each other, in units of the largest one
 
 
+def check_board_name(name: str) -> None:
+    """Refuse a name that a board may not have, with an InputError."""
+    if not name or set("/:\r\n") & set(name):
+        raise InputError(
+            f"the board {name[:40]!r} has no name, or one with a slash, colon or line break; name each board"
+        )
+
+
 def by_board(
     view: NDArray[Any], point: NDArray[Any] | None, board: NDArray[Any]
 ) -> tuple[NDArray[np.str_], NDArray[np.str_] | None]:
-    """Names of views and ids of points (N,) in which the boards (N,) are told apart.
-
-    Raises InputError for a board without a name, or with a slash or a colon in it.
-    """
+    """Names of views and ids of points (N,) by which the boards (N,) are told apart."""
     names = board.astype(str)
     for name in np.unique(names).tolist():
-        if not name or "/" in name or ":" in name:
-            raise InputError(
-                f"the board {name[:40]!r} has no name, or one with a slash or a colon; name each board"
-            )
+        check_board_name(name)
     views = np.char.add(np.char.add(view.astype(str), ":"), names)
     ids = None if point is None else np.char.add(np.char.add(names, "/"), point.astype(str))
     return views, ids

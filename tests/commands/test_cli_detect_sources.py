@@ -225,10 +225,11 @@ def test_the_watch_goes_on_past_names_that_cannot_be_those_of_views(tmp_path: Pa
     assert "1 of 1 images" in result.stderr
     points.unlink()
     (folder / "board01.PNG").unlink()
-    result = run("detect", folder, *BOARD, "-o", points)
-    assert result.exit_code == 1
-    assert "board detected" not in result.stderr  # told before the images are examined
-    assert not points.exists()
+    for words in ([folder], [folder / "board01.png", "--board-name", "a/b"]):
+        result = run("detect", *words, *BOARD, "-o", points)
+        assert result.exit_code == 1
+        assert "board detected" not in result.stderr  # told before the images are examined
+        assert not points.exists()
 
 
 def test_an_interrupt_ends_the_watch_and_the_points_are_written(

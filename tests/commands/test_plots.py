@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 from support.command_line import run
 from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
@@ -19,8 +26,9 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
 from neurocal_cli.calibration.rig.rig import StereoRig
-from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
+from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS, plot_pages
 from neurocal_cli.commands.show.camera_panels import Subject
+from neurocal_cli.commands.show.figure import drawing
 from neurocal_cli.commands.show.plot_pages import draw_camera, draw_points_in_space, draw_stereo
 
 BEGINNINGS = {"png": b"\x89PNG\r\n", "pdf": b"%PDF", "svg": b"<?xml"}
@@ -93,6 +101,38 @@ def rig() -> StereoRig:
 @pytest.mark.parametrize("panel", slow_but(("poses",), (None, *CAMERA_PANELS)))
 def test_a_rig_is_drawn(rig: StereoRig, panel: str | None) -> None:
     assert draw_stereo(rig, "png", panel).startswith(BEGINNINGS["png"])
+
+
+@pytest.mark.parametrize("page", slow_but(("upright images",), ["upright images", "a rig"]))
+def test_no_title_of_a_page_is_cut_off(monkeypatch: pytest.MonkeyPatch, rig: StereoRig, page: str) -> None:
+    drawn = []
+
+    @contextmanager
+    def kept(*how: Any) -> Iterator[tuple[Figure, BytesIO]]:
+        with drawing(*how) as (figure, file):
+            drawn.append(figure)
+            yield figure, file
+
+    monkeypatch.setattr(plot_pages, "drawing", kept)
+    if page == "a rig":
+        draw_stereo(rig)
+    else:
+        cal = made_calibration(3)
+        draw_camera(Subject.of(replace(cal, points=replace(cal.points, image_size=(640, 1280)))))
+    (figure,) = drawn
+    figure.draw_without_rendering()  # at its own resolution, not that of the file
+    whole = figure.get_window_extent()
+    words = {
+        word
+        for axes in figure.findobj(Axes)
+        for word in (axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left"))
+    }
+    texts = [text for text in figure.findobj(Text) if text.get_text() in words - {""}]
+    assert len(texts) > 15
+    for text in texts:
+        box = text.get_window_extent()
+        assert whole.x0 <= box.x0 < box.x1 <= whole.x1, text
+        assert whole.y0 <= box.y0 < box.y1 <= whole.y1, text
 
 
 @pytest.mark.parametrize("panel", slow_but((None,), (None, *SPACE_PANELS)))

@@ -281,6 +281,9 @@ def test_files_that_are_not_utf8_text_are_refused(read):
     assert "is an image, not a CSV file of points; find its points first: `neurocal detect" in complaint(
         read, b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\2\x80"
     )
+    assert "is a video, not a CSV file of points; find its points first: `neurocal detect" in complaint(
+        read, b"\0\0\0\x20ftypisom\0\0\2\0isomiso2"
+    )
     assert complaint(read, b"X,Y,Z,u,v\n1,2,3,4,5\xe9\n").startswith("a.csv:2: byte 0xe9 is not UTF-8")
 
 

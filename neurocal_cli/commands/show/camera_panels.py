@@ -79,7 +79,8 @@ class Subject:
 def set_image(axes: Axes, subject: Subject) -> Array:
     """Set the axes to the image, or to the points if its size is unknown; returns the four limits."""
     left, right, top, bottom = frame = _frame(subject)
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u [px]", ylabel="v [px]")
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u [px]", ylabel="v [px]")
+    axes.set_aspect("equal", anchor="W")  # its title begins at its left, and needs the room beside it
     axes.spines[["top", "right"]].set_visible(True)
     return frame
 
@@ -128,8 +129,9 @@ def draw_scatter(axes: Axes, subject: Subject) -> None:
     axes.plot(*circle, color=ACCENT, linewidth=1.5)
     axes.plot(evaluation.bias_u, evaluation.bias_v, "+", color=ACCENT, markersize=9)
     limit = 1.1 * max(evaluation.max_px, 1e-12) if np.isfinite(evaluation.max_px) else 1.0
-    style(axes, f"Residuals of all points, rms {evaluation.rmse_px:.3g} px")
-    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", ylabel="dv [px]")
+    style(axes, f"All residuals, rms {evaluation.rmse_px:.3g} px")
+    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), ylabel="dv [px]")
+    axes.set_aspect("equal", anchor="W")
     axes.set_xlabel("du [px]; the circle is the rms, + the mean")
 
 
@@ -209,7 +211,7 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     pixels = subject.points.pixels
     axes.plot(*pixels[:: max(1, len(pixels) // 1000)].T, ".", color="white", markersize=1, alpha=0.7)
     unit = "" if subject.calibration is None else plain(subject.calibration.unit)
-    style(axes, f"Uncertainty at {projection.depths[1]:.3g} {unit}: {projection.worst:.3g} px at most")
+    style(axes, f"Uncertainty at {projection.depths[1]:.3g} {unit}: up to {projection.worst:.3g} px")
     axes.grid(False)
 
 

@@ -161,16 +161,17 @@ def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> 
     rows = [
         [f"{side} {name}" for side in sides] for name in ("residuals", "uncertainty", "coverage", "views")
     ]
-    rows.append(["poses"] * 2)
+    rows.insert(3, ["poses"] * 2)  # not lowest, where labels in space would be cut off
+    heights: tuple[float, ...] = (1, 1, 1, 1.3, 0.7)
     size = _PAGE[0], 1.25 * _PAGE[1]
     if panel not in (None, "poses"):
-        rows, panel = [[f"{side} {panel}" for side in sides]], None
+        rows, heights, panel = [[f"{side} {panel}" for side in sides]], (1,), None
         size = 2 * _PANEL[0], _PANEL[1]
     title = (
         f"rms {rig.rmse_px:.4g} px, max {rig.max_px:.4g} px, {len(rig.pairs)} pairs of views, baseline "
         f"{rig.baseline:.6g} {plain(rig.unit)}"
     )
-    return _page(rows, (1,) * len(rows), panels, title, size, kind, panel)
+    return _page(rows, heights, panels, title, size, kind, panel)
 
 
 def draw_rig(rig: Rig, kind: str = "png") -> bytes:
