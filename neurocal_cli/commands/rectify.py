@@ -88,7 +88,7 @@ def rectify(
       neurocal calibrate points.csv -o left.yaml
       neurocal convert left.yaml --to kalibr -o cam0.yaml
       (echo cam0:; sed "1d" cam0.yaml; echo cam1:; sed "1d" cam0.yaml; \\
-          echo "  T_cn_cnm1: [[1,0,0,-0.1],[0,1,0,0],[0,0,1,0],[0,0,0,1]]") \\
+          echo "   T_cn_cnm1: [[1,0,0,-0.1],[0,1,0,0],[0,0,1,0],[0,0,0,1]]") \\
           > camchain.yaml
       neurocal rectify camchain.yaml "sample_data/board0[123].png" \\
           "sample_data/board0[456].png" --alpha 0 --interpolation linear \\
