@@ -340,8 +340,6 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
 
     The correlation is that of the closest fit, because a model that is too simple adds correlation.
     """
-    if not fitted:
-        return 1.0
     closest = min(fitted, key=lambda candidate: candidate.cost).adjusted.state
     side = float(np.sqrt(np.mean(views.counts)))
     return independent_residuals(views, closest, side)

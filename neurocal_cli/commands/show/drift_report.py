@@ -157,10 +157,9 @@ def _parameter_table(old: Calibration | Camera, new: Calibration | Camera) -> Ta
     for name, (a, b, std) in _compared(old, new).items():
         if a == b and not std > 0:
             continue
-        known = std > 0
         difference, stated = rounded(b - a, std)
         values = [rounded(x, std)[0] for x in (a, b)]
-        ratio = f"{(b - a) / std:+.1f}" if known else "-"
+        ratio = f"{(b - a) / std:+.1f}" if std > 0 else "-"
         rows.append([labelled(name, UNITS.get(name, "")), *values, difference, stated, ratio])
     return rows
 

@@ -256,9 +256,8 @@ def _bias(study: NoiseStudy, one: MethodErrors, p: int) -> str:
 
 def rates_report(study: RateStudy) -> Report:
     """On how many data sets one start converges, for each pair of rates, and how fast."""
-    head = ["weights \\ gamma", *(f"{rate:g}" for rate in study.rates_gamma)]
-    counts = [head]
-    epochs = [list(head)]
+    counts = [["weights \\ gamma", *(f"{rate:g}" for rate in study.rates_gamma)]]
+    epochs = counts[:]
     for a, rate in enumerate(study.rates_weights):
         counts.append([f"{rate:g}", *map(str, study.converged[a])])
         epochs.append([f"{rate:g}", *("-" if np.isnan(e) else f"{e:.0f}" for e in study.epochs[a])])
