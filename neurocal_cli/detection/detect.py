@@ -15,7 +15,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.measuring import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.grey import blurred, grey_image, negative
+from neurocal_cli.detection.grey import blurred, grey_image, is_drawn, negative
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identify import Identified, Located, identify
 from neurocal_cli.detection.markers.locate import check_measured_spacing, locate
@@ -139,14 +139,16 @@ def detect_points(
     measured = _all_measured(image, identified.located, points, gamma)
     every = [one.vertex_ids() if points == "vertices" else one.midpoint_ids() for one in board.planes]
     fewest = min(_FEWEST, sum(map(len, every)))
-    if not is_plain(board) and sum(len(one.kind) for one in measured) < fewest:
-        # The edges of a board that is drawn in whole pixels lack the blur which tells their places.
-        image = blurred(image)
-        identified = _identified(image, board, grids)
-        measured = _all_measured(image, identified.located, points, gamma)
+    if (_count(measured) < fewest or any(one.rejected for one in measured)) and is_drawn(image):
+        # Edges that are drawn in whole pixels lack the blur which tells their places.
+        soft = blurred(image)
+        again = _identified(soft, board, None)
+        more = _all_measured(soft, again.located, points, gamma)
+        if _count(more) > _count(measured):
+            identified, measured = again, more
     located = identified.located
-    count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
-    if count < fewest:
+    rejected = sum(one.rejected for one in measured)
+    if (count := _count(measured)) < fewest:
         if not rejected:
             raise NoBoardError(f"only {count} points of the board are seen; show more of it")
         share = f"{count} of {count + rejected} points"
@@ -172,6 +174,10 @@ def detect_points(
         measured,
         identified.notes,
     )
+
+
+def _count(measured: Iterable[Measured]) -> int:
+    return sum(len(one.kind) for one in measured)
 
 
 def _all_measured(

@@ -13,6 +13,7 @@ from neurocal_cli.errors import InputError
 
 _EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of noise-free images
 _DRAWN = 0.7  # px, the blur of drawn edges
+_FLAT = 0.9  # least share of equal neighbours in a drawn image; 0.96 beside warped boards
 _TO_GREY = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}  # by the number of channels
 
 
@@ -70,6 +71,11 @@ def negative(image: NDArray[Any]) -> NDArray[Any]:
     """Exchange light and dark in a grey image."""
     brightest = np.iinfo(image.dtype).max if image.dtype.kind == "u" else image.max()
     return np.asarray(brightest - image)
+
+
+def is_drawn(image: NDArray[Any]) -> bool:
+    """Whether a grey image has no noise, as nearly all of its pixels are exactly like those beside them."""
+    return bool(np.count_nonzero(image[:, 1:] == image[:, :-1]) > _FLAT * image.size)
 
 
 def blurred(image: NDArray[Any]) -> NDArray[Any]:

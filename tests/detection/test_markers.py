@@ -646,3 +646,19 @@ def test_a_board_that_is_drawn_in_whole_pixels_is_measured() -> None:
     found = detect_points(drawn, short_board("charuco:8x6:30:22:DICT_5X5_100"), "vertices")
     assert len(found.ids) == 35
     assert np.abs(found.pixels - (found.world[:, :2] / 30 * 140 + [219.5, 199.5])).max() < 0.1
+
+
+def test_a_chessboard_that_is_drawn_and_warped_is_measured() -> None:
+    """Its edges have steps of a pixel, which a blur smooths."""
+    board = np.full((400, 520), 255, np.uint8)
+    row, column = np.indices((280, 400)) // 40
+    board[60:-60, 60:-60][(row + column) % 2 == 0] = 0
+    corners = np.array([[0, 0], [520, 0], [520, 400], [0, 400]], np.float32)
+    H = cv2.getPerspectiveTransform(
+        corners, np.array([[40, 30], [460, 70], [500, 350], [70, 380]], np.float32)
+    )
+    found = detect_points(cv2.warpPerspective(board, H, (520, 400), borderValue=255), Board.single(9, 6, 40))
+    assert (len(found.ids), found.rejected) == (93, 0)
+    places = found.world[:, :2] + np.array([99.5, 99.5])  # of the drawing, or turned by half a turn
+    both = cv2.perspectiveTransform(np.stack([places, [519, 399] - places]), H)
+    assert np.abs(both - found.pixels).max(axis=(1, 2)).min() < 0.6

@@ -110,7 +110,8 @@ def _edges_visible(level: Level, saddles: Saddles, first: Index, second: Index) 
     """(E,) mask of edges, from even ports, with dark and light on the right sides along their length."""
     start, step = saddles.points[first], saddles.points[second] - saddles.points[first]
     length = np.hypot(*step.T)
-    normal = np.stack([-step[:, 1], step[:, 0]], axis=-1) / length[:, None]
+    # Of a drawn image, two saddle points may have one place.
+    normal = np.stack([-step[:, 1], step[:, 0]], axis=-1) / np.maximum(length, 1e-9)[:, None]
     reach = np.clip(0.2 * length, 1.0, 2.5)
     share = np.array([0.3, 0.5, 0.7])
     middle = start[:, None] + share[:, None] * step[:, None]
