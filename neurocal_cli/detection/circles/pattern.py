@@ -19,7 +19,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.appearance import departure_from_circles
 from neurocal_cli.detection.circles.lattice import BASES, Blobs, find_blobs, lattices
-from neurocal_cli.detection.grey import blurred, eight_bits, is_drawn
+from neurocal_cli.detection.grey import eight_bits
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
@@ -84,9 +84,8 @@ def _seen_in(
     if share < _LEAST_SHARE or min(seen.cols, seen.rows) < _FEWEST_ROWS:
         return None
     area = blobs.area[list(lattice.values())]
-    drawn = is_drawn(grey)  # in whole pixels, from which circles depart
-    light = (blurred(grey) if drawn else grey).astype(np.float32)
-    departure, of_hexagons = departure_from_circles(light, places, centre, area, described=drawn)
+    light = grey.astype(np.float32)
+    departure, of_hexagons = departure_from_circles(light, places, centre, area, described=False)
     if departure > _DEPARTURE:
         return None
     full = share == 1

@@ -22,12 +22,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.appearance import are_squares
 from neurocal_cli.detection.finding.grow import grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
-from neurocal_cli.detection.finding.links import (
-    Links,
-    find_links,
-    find_seeds,
-    lattice_from_links,
-)
+from neurocal_cli.detection.finding.links import Links, find_links, find_seeds, linked_lattice
 from neurocal_cli.detection.finding.overlaps import (
     drop_duplicates,
     merge_lattices,
@@ -163,25 +158,20 @@ def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozense
     seeds, tries = find_seeds(links), _TRIES
     found: list[Lattice] = []
     saddles = links.saddles
-    free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
+    free = np.ones(len(saddles), dtype=bool)
     nearest = _nearest_whole(known, wanted)
     sides = _sides(saddles.points[seeds]) if wanted and len(seeds) else np.full(len(seeds), np.inf)
     for seed, side in zip(seeds, sides.tolist(), strict=True):
         if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
-        lattice = lattice_from_links(level, links, int(seed[1, 1]), taken)
-        if lattice is not None and lattice.seen.all() and level.scale > 1:
-            grid = lattice  # finer levels complete it
-        else:
-            first = Lattice(saddles.points[seed], saddles.contrast[seed], 0)
-            grid = remove_outliers(level, grow(level, first if lattice is None else lattice))
+        first = linked_lattice(links, int(seed[1, 1]))
+        grid = remove_outliers(level, grow(level, refined(level, first, first.derivative_sigma, 1)))
         boards = [x for x in _boards(grid) if is_smooth(level, x)]
         if boards:
             found += boards
             nearest = max(nearest, _nearest_whole(boards, wanted))
-            taken |= _mask(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] > 0
-            free &= ~taken
+            free &= _mask(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
         else:
             tries -= 1
         if tries <= 0:

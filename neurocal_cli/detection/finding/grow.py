@@ -175,7 +175,11 @@ def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
         row, col, predicted = lattice.predicted
         if not len(row):
             break
-        lattice, check, off = _checked(level, lattice)
+        points = lattice.pixels[row, col]
+        check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
+        contrast = lattice.contrast.copy()
+        contrast[row, col] = check.contrast
+        lattice, off = replace(lattice, contrast=contrast), _off(predicted, points)
         # Vertices outside complete squares have fewer neighbours to confirm them.
         closes = in_whole_square(lattice.seen)[row, col]
         accepted = check.is_vertex & (closes | ((check.evenness > _EVEN_ALONE) & (off < _OFF_ALONE)))
@@ -189,31 +193,6 @@ def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
         bad = (worst > 1) & (worst >= cv2.dilate(worst, np.ones((3, 3), np.uint8)))
         lattice = lattice.subset(~bad)
     return lattice.cropped()
-
-
-def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
-    """Measure the contrasts of the vertices, and return a mask of the vertices that pass all tests."""
-    row, col, predicted = lattice.predicted
-    lattice, check, off = _checked(level, lattice)
-    good = np.zeros(lattice.contrast.shape, dtype=bool)
-    good[row, col] = (
-        check.is_vertex
-        & (off < 1)
-        & (predicted.area > 4)
-        & (predicted.spread < 2 * _MOST_SPREAD)
-        & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
-    )
-    return lattice, good
-
-
-def _checked(level: Level, lattice: Lattice) -> tuple[Lattice, VertexCheck, Array]:
-    """The lattice with measured contrasts, its vertices' checks, and how far these are off, in tolerances."""
-    row, col, predicted = lattice.predicted
-    points = lattice.pixels[row, col]
-    check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
-    contrast = lattice.contrast.copy()
-    contrast[row, col] = check.contrast
-    return replace(lattice, contrast=contrast), check, _off(predicted, points)
 
 
 @frozen_dataclass(eq=False)

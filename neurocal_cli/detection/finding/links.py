@@ -3,26 +3,20 @@
 The blocks are the seeds of grids. An edge that leaves a vertex at a port followed by a dark sector enters the
 next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects an even with
 an odd port.
-
-`lattice_from_links` is a shortcut for growth: it builds most of a grid at once, by following links from
-vertex to vertex. The lattice is accepted only if every vertex passes the tests of `grow`. Growing layer by
-layer gives the same result more slowly.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.finding.grow import check_lattice
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square
-from neurocal_cli.detection.finding.overlaps import largest_second_difference, split_at_folds
-from neurocal_cli.detection.finding.saddles import Level, Saddles, find_saddles, interpolate, refine_saddles
+from neurocal_cli.detection.finding.overlaps import split_at_folds
+from neurocal_cli.detection.finding.saddles import Level, Saddles, find_saddles, interpolate
 
 # Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -34,13 +28,6 @@ _SHARE = 0.45  # the same angle as a share of the vertex's narrower angle
 _ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within the latter angle
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... or greatest second difference times this weight
-# Insensitive: a lattice rejected here is grown instead, which only costs time
-# (test_detection_speed.py).
-_NEAR = 1.0  # px; greatest shift of a saddle when derivatives are smoothed more
-_FEWEST_AT_ONCE = 12  # vertices; smaller lattices are grown from the seed
-_ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
-_MOST_CURVED = 0.16  # squares; a larger second difference may be a fold
-_WHOLE = 0.5  # least share of linked vertices in an outer line; links beyond the board are wrong
 
 
 @frozen_dataclass(eq=False)
@@ -50,11 +37,6 @@ class Links:
     saddles: Saddles
     to: Index  # (N, 4) the neighbour at each port; -1 if there is none
     port: Index  # (N, 4) the neighbour's port at the other end of the edge
-
-    @cached_property
-    def lists(self) -> tuple[list[list[int]], list[list[int]]]:
-        """Both arrays as lists, which are faster to index one by one."""
-        return self.to.tolist(), self.port.tolist()
 
 
 def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links | None:
@@ -181,73 +163,12 @@ def _closed(links: Links) -> NDArray[np.bool_]:
     return alive & (at == home) & (port == np.arange(4)[None])
 
 
-def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[np.bool_]) -> Lattice | None:
-    """Follow the links that start at a vertex, whose port 0 points along c, and test the resulting lattice.
-
-    `taken` (N,) marks saddles that belong to other grids. None if the vertices fail the tests.
-    """
-    place, member = _follow(links, middle, taken.tolist())
-    if len(place) < _FEWEST_AT_ONCE:
-        return None
-    saddles = links.saddles
-    lattice = _lattice(saddles, place, member)
-    row, col = np.nonzero(lattice.seen)
-    refined = refine_saddles(level.image, lattice.pixels[row, col], lattice.derivative_sigma)
-    stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
-    lattice.pixels[row, col] = np.where(stays[:, None], refined, np.nan)
-    # Links may cross folds.
-    part = _with(split_at_folds(lattice), saddles.points[middle])
-    for _ in range(_ROUNDS):
-        count = 0 if part is None else np.count_nonzero(part.seen)
-        if part is None or count < _FEWEST_AT_ONCE:
-            break
-        part, good = check_lattice(level, part)
-        wrong = count - np.count_nonzero(good)
-        if wrong == 0:
-            # A gap may hide a fold.
-            return part if largest_second_difference(part) < _MOST_CURVED else None
-        if wrong > _WRONG * count:
-            break
-        # Vertices removed here can be found again when the grid grows.
-        part = _with(part.subset(in_whole_square(good)).connected_parts(), saddles.points[middle])
-    return None
-
-
-def _lattice(saddles: Saddles, place: Index, member: Index) -> Lattice:
-    """Make a lattice of saddles by their places (c, r), without incomplete squares and sparse outer lines."""
-    left, top = place.min(axis=0)
-    cols, rows = place.max(axis=0) - (left, top) + 1
-    index = np.full((rows, cols), -1, dtype=np.intp)
-    index[place[:, 1] - top, place[:, 0] - left] = member
-    seen = in_whole_square(index >= 0)
-    for line in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
-        seen[line] &= seen[line].mean() > _WHOLE
-    row, col = np.nonzero(seen)
-    pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
-    pixels[row, col], contrast[row, col] = (x[index[row, col]] for x in (saddles.points, saddles.contrast))
-    # The square between ports 0 and 1 of the middle vertex is dark.
-    return Lattice(pixels, contrast, int(left + top) % 2).cropped()
-
-
-def _with(parts: list[Lattice], point: Array) -> Lattice | None:
-    """The lattice with a vertex at a point [px]."""
-    near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
-    return next(near, None)
-
-
 def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
-    """Places (N, 2) and saddles (N,) reached by links from a saddle, as far as they form whole squares."""
-    place, member = _follow(links, middle, [False] * len(links.to))
-    place -= place.min(axis=0)
-    seen = np.zeros(place.max(axis=0) + 1, dtype=bool)
-    seen[tuple(place.T)] = True
-    kept = in_whole_square(seen)[tuple(place.T)]
-    return place[kept], member[kept]
+    """Places (N, 2) and saddles (N,) reached by links from a saddle, as far as they form whole squares.
 
-
-def _follow(links: Links, middle: int, taken: list[bool]) -> tuple[Index, Index]:
-    """Places (N, 2) relative to the middle saddle, and saddles (N,) there, by a breadth-first search."""
-    to, entry = links.lists
+    The search is breadth-first.
+    """
+    to, entry = links.to.tolist(), links.port.tolist()
     places, along = {(0, 0): middle}, {middle: 0}  # saddle by place, and its port along c
     waiting = deque(places)
     while waiting:
@@ -256,9 +177,28 @@ def _follow(links: Links, middle: int, taken: list[bool]) -> tuple[Index, Index]
         for turn, (dc, dr) in enumerate(_STEPS):
             port = (along[saddle] + turn) % 4
             neighbour, there = to[saddle][port], (c + dc, r + dr)
-            if neighbour < 0 or taken[neighbour] or there in places or neighbour in along:
+            if neighbour < 0 or there in places or neighbour in along:
                 continue
             places[there] = neighbour
             along[neighbour] = (entry[saddle][port] + 2 - turn) % 4
             waiting.append(there)
-    return np.array(list(places)), np.array(list(places.values()))
+    place, member = np.array(list(places)), np.array(list(places.values()))
+    place -= place.min(axis=0)
+    seen = np.zeros(place.max(axis=0) + 1, dtype=bool)
+    seen[tuple(place.T)] = True
+    kept = in_whole_square(seen)[tuple(place.T)]
+    return place[kept], member[kept]
+
+
+def linked_lattice(links: Links, middle: int) -> Lattice:
+    """The part without folds of the saddles reached by links from one with four closed squares around it."""
+    place, member = linked_group(links, middle)
+    c, r = place.T
+    shape = r.max() + 1, c.max() + 1
+    pixels, contrast = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
+    pixels[r, c], contrast[r, c] = links.saddles.points[member], links.saddles.contrast[member]
+    # The square between ports 0 and 1 of the middle vertex is dark.
+    whole = Lattice(pixels, contrast, int(place[member == middle].sum()) % 2)
+    own = links.saddles.points[middle]
+    parts = (part for part in split_at_folds(whole) if (part.pixels == own).all(axis=2).any())
+    return next(parts, whole)

@@ -204,11 +204,6 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
     return [piece for part in parts if part.seen.any() for piece in split_at_folds(part)]
 
 
-def largest_second_difference(lattice: Lattice) -> float:
-    """Largest median second difference of any row or column [squares], folds included."""
-    return max(float(_size(second).max()) for second in _second_differences(lattice))
-
-
 def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
     """Second differences along columns (rows, cols, 2) and rows (cols, rows, 2) [squares]; NaN if unknown."""
     pixels = lattice.pixels
