@@ -345,6 +345,16 @@ def test_the_outline_inside_a_blurred_border_is_not_that_of_the_marker() -> None
         assert np.linalg.norm(corners[:, None] - true, axis=2).min(axis=0).max() < 2.5
 
 
+def test_all_clear_codes_of_a_dictionary_are_read() -> None:
+    """Also cells of one colour among others of it."""
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    corners = np.array([[[9.5, 9.5], [69.5, 9.5], [69.5, 69.5], [9.5, 69.5]]])
+    for number in range(1000):
+        code = cv2.aruco.generateImageMarker(family, number, 60)
+        clear = cv2.copyMakeBorder(code, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=255)
+        assert numbers_in(clear, corners, "DICT_4X4_1000", 1).tolist() == [number]
+
+
 def test_no_quadrangles_have_no_numbers() -> None:
     """A picture may have no whole tag."""
     light = np.zeros((40, 40), dtype=np.float32)

@@ -146,7 +146,7 @@ def _detector():  # type: ignore[no-untyped-def]
 
 _WITHIN = (-0.25, 0.0, 0.25)  # of a cell, where it is sampled
 _WRONG_BORDER, _ROUGHLY_WRONG = 0.1, 0.3  # greatest share of light cells in a border
-_ROUNDS = 2  # in which a cell's light is compared with that of the cells beside it, which a blur mixes
+_ROUNDS = 3  # in which a cell's light is compared with that of the cells beside it, which a blur mixes
 _EXTREME = 0.2  # share of the darkest and of the lightest cells that give the levels
 _CONTRAST = 12.0  # DN, least difference of these
 _FEWEST = 2  # markers
@@ -285,7 +285,8 @@ def _cells(
         for _ in range(rounds):
             columns, rows = level[:, 1:-1], level[:, :, 1:-1]
             beside = columns[..., 2:] + columns[..., :-2] + rows[:, 2:] + rows[:, :-2]
-            level = 2 * level[:, 1:-1, 1:-1] - 0.25 * beside
+            # Within black and white, or what is beside an edge would change what is beside that.
+            level = np.clip(2 * level[:, 1:-1, 1:-1] - 0.25 * beside, low[:, None, None], high[:, None, None])
         light = level > 0.5 * (low + high)[:, None, None]
         inner = light[:, border:-border, border:-border]
         wrong = light.sum(axis=(1, 2)) - inner.sum(axis=(1, 2))
