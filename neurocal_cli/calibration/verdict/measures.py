@@ -21,7 +21,7 @@ from neurocal_cli.adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix
+from neurocal_cli.camera.geometry import Array, by_motion, cross_matrix
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
@@ -65,18 +65,12 @@ def projection_uncertainty(
     Pixels of a wide lens that are much farther out than the angle [rad] of the `farthest` point lie beyond
     its image circle.
     """
-    motions = _motions(m)
     rays = camera.seen_points(pixels)
     if farthest is not None:
         rays = np.where(rays[:, 2:] < np.cos(min(max(_BEYOND * farthest, _LEAST), np.pi)), np.nan, rays)
-    by_camera, by_point = _derivatives(m, camera, rays)
-    std = np.empty((len(depths), len(pixels)))
-    for k, depth in enumerate(depths):
-        J, by_motion = _moving(motions, depth * rays, by_camera, by_point / depth)
-        # The traces of J cov J^T.
-        of_camera = (J @ shared * J).sum(axis=(1, 2))
-        std[k] = np.sqrt(of_camera + variance * (by_motion @ motions[1] * by_motion).sum(axis=(1, 2)))
-    return ProjectionUncertainty(pixels, depths, std)
+    points = (depths[:, None, None] * rays).reshape(-1, 3)
+    variances = np.trace(pixel_covariance(m, camera, variance, points, shared), axis1=1, axis2=2)
+    return ProjectionUncertainty(pixels, depths, np.sqrt(variances).reshape(len(depths), -1))
 
 
 def pixel_covariance(
@@ -87,20 +81,12 @@ def pixel_covariance(
     The points are fixed to the target of a view, or, as above, to the targets of all views. The other
     parameters are those of `projection_uncertainty`.
     """
-    motions = _motions(m, None if view is None else m.views.names.index(view))
-    J, by_motion = _moving(motions, points, *_derivatives(m, camera, points))
+    gain, motion = _motions(m, None if view is None else m.views.names.index(view))
+    by_camera, by_point = _derivatives(m, camera, points)
+    moved = by_point @ by_motion(points)
+    J = by_camera + moved @ gain
     of_camera = J @ shared @ np.swapaxes(J, 1, 2)
-    return np.asarray(of_camera + variance * (by_motion @ motions[1] @ np.swapaxes(by_motion, 1, 2)))
-
-
-def _moving(
-    motions: tuple[Array, Array], points: Array, by_camera: Array, by_point: Array
-) -> tuple[Array, Array]:
-    """Derivatives of pixels by the camera and the motion it causes (N, 2, f), and by a motion (N, 2, 6)."""
-    n = len(points)
-    moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
-    by_motion = by_point @ moved
-    return by_camera + by_motion @ motions[0], by_motion
+    return np.asarray(of_camera + variance * (moved @ motion @ np.swapaxes(moved, 1, 2)))
 
 
 def _motions(m: Minimum, view: int | None = None) -> tuple[Array, Array]:
