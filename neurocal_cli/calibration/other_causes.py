@@ -24,7 +24,7 @@ from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
-from neurocal_cli.calibration.verdict.contest import Contest, contest
+from neurocal_cli.calibration.verdict.contest import contest
 from neurocal_cli.calibration.verdict.findings import DETERMINE, EXPLAINED, LEVEL
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import causes_among
@@ -84,7 +84,11 @@ def odd_view(solution: Solution) -> str | None:
     if views.n_views <= DETERMINE or problem.type == 3:
         return None
     if not problem.free_poses:
-        return _with_wrong_pose(contest(solution.minimum, problem.points.image_size))
+        held = contest(solution.minimum, problem.points.image_size)
+        first = held.causes[0] if held is not None and held.causes else None
+        if first is None or first.rival is not ODD_POSE or first.explained < EXPLAINED:
+            return None
+        return views.names[int(first.weights.argmax())]
     conditions = conditions_on_views(views, adjusted.state)
     spare = views.equations - 6 - conditions
     if spare.min() <= 0:
@@ -112,14 +116,6 @@ def odd_view(solution: Solution) -> str | None:
     rivals = causes_among((ODD_VIEW, ANOTHER_LENS, *SHAPES), solution.minimum, held.n)
     odds = next((one.evidence for one in rivals if one.rival is ODD_VIEW), 0.0) + LEVEL
     return None if any(one.evidence > odds for one in rivals) else views.names[view]
-
-
-def _with_wrong_pose(held: Contest | None) -> str | None:
-    """The view whose given pose is wrong, if that explains most of the error."""
-    first = held.causes[0] if held is not None and held.causes else None
-    if held is None or first is None or first.rival is not ODD_POSE or first.explained < EXPLAINED:
-        return None
-    return held.lin.views.names[int(first.weights.argmax())]
 
 
 def _contradictions(normal: Array, free: NDArray[np.bool_], own: Array) -> Array:

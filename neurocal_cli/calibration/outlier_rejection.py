@@ -114,7 +114,8 @@ def fit_robustly(
             raise
         return solution, _rejected(problem.points, kept, solution)
     errors = point_errors(first, problem.points)
-    contradicts = _contradicts_noise(first, errors)
+    whole = np.ones(len(problem.points), dtype=bool)
+    contradicts = not _near(errors, whole, problem.points).all() or odd_view(first) is not None
     # So large errors may hide outliers.
     rough = errors.rms > _ROUGH * pixel_spread(problem.points)
     if not (contradicts or rough):
@@ -182,14 +183,6 @@ def _evidence(solution: Solution) -> float:
 def _is_of(points: Correspondences, view: str) -> NDArray[np.bool_]:
     """(N,) which points are of a view."""
     return points.view_index == points.view_names.index(view)
-
-
-def _contradicts_noise(solution: Solution, errors: PointErrors) -> bool:
-    """Whether anything in a fit is inconsistent with normal noise."""
-    points = solution.problem.points
-    if not _near(errors, np.ones(len(points), dtype=bool), points).all():
-        return True
-    return odd_view(solution) is not None
 
 
 def _with_common_cause(first: Solution, options: Options) -> tuple[_Kept, Solution] | None:

@@ -220,7 +220,7 @@ def _searched(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
     """Alternate between target and camera as `with_target` does, from the views of one solution."""
-    if not _can_tell(solution, choice, None):
+    if not _can_tell(solution, None):
         return solution, rejected
     kept = solution.noted(target_kept=choice == "auto")
     if choice == "auto" and not _tell_independently(solution):
@@ -254,7 +254,7 @@ def _settled(
             break
         fitted, outliers = again
         same_views = fitted.problem.views.names == solution.problem.views.names
-        if not (same_views or _can_tell(fitted, choice, found.target)):
+        if not (same_views or _can_tell(fitted, found.target)):
             break
         if not _is_where_it_was(found, fitted):
             refound = _found(fitted, choice, found.target)
@@ -269,7 +269,7 @@ def _settled(
     return None if best is None else (best, rejected)
 
 
-def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
+def _can_tell(solution: Solution, known: Target | None) -> bool:
     """Whether there are enough independent views to estimate the target."""
     problem = solution.problem
     points = problem.points if known is None else known.straightened(problem.points)

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.cross_validation import Quadratics, quietly
+from neurocal_cli.adjustment.cross_validation import FOLDS, Quadratics, quietly
 from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
@@ -48,7 +48,6 @@ from neurocal_cli.camera.geometry import Array, median
 # as much as noise explains.
 _SCATTER = Limit(6.0, 12.0)
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the views
-_FOLDS = 5
 _NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[-+]?\d+)?(?: (?:%|px|mm))?")  # in a reason, with its unit
 _MOST_DIFFERENT = 2  # numbers of reasons that are told together
 
@@ -121,7 +120,7 @@ def _held_out(fit: RigFit) -> float:
     views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
     several = np.flatnonzero(problem.together)
     fold = np.full(len(problem.scale), -1)
-    fold[several] = folds_of(len(several), _FOLDS)
+    fold[several] = folds_of(len(several), FOLDS)
     parts = []
     for k in range(int(fold.max()) + 1):
         left = several[fold[several] != k]
@@ -204,7 +203,7 @@ def told_once(texts: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], str]:
     told = {(name, text): f"{_named(name)}: {text}" for name, own in texts.items() for text in own}
     for several in alike.values():
         names, numbers = list(several), {name: _NUMBER.findall(text) for name, text in several.items()}
-        first = max(names, key=lambda name: [_value(one) for one in numbers[name]])
+        first = max(names, key=lambda name: [float(one.split()[0]) for one in numbers[name]])
         differ = {
             name: [one for one, before in zip(numbers[name], numbers[first], strict=True) if one != before]
             for name in names
@@ -217,11 +216,6 @@ def told_once(texts: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], str]:
             text = f"{whose}: {several[first]}" + (f" ({'; '.join(besides)})" if besides else "")
             told |= dict.fromkeys(several.items(), text)
     return told
-
-
-def _value(number: str) -> float:
-    """Of a number with its unit."""
-    return float(number.split()[0])
 
 
 def _named(name: str) -> str:

@@ -22,6 +22,7 @@ from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.problem import Motion, RigProblem, steps_through
 from neurocal_cli.calibration.verdict.effects import step
 from neurocal_cli.calibration.verdict.findings import (
+    DETERMINE,
     EXPLAINED,
     LEVEL,
     Cause,
@@ -36,7 +37,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 
 _FREE = np.array([0, 2, *POSE_COLUMNS])  # alpha_u, alpha_v and the pose of a view in its camera
-_FEWEST = 3  # frames that show no change
 _OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they are equal
 
 
@@ -290,7 +290,7 @@ class _Rivals:
         n, choices = len(its.S), 1.0 if its.rival.of_all else float(len(self.seen))
         if not its.rival.is_change:
             yield "all", np.ones((1, n)), choices
-        elif n > _FEWEST:
+        elif n > DETERMINE:
             name, weights, places = step(np.arange(n))
             if self.is_held:
                 weights, places = np.concatenate([weights, 1.0 - weights]), 2 * places

@@ -40,7 +40,6 @@ from neurocal_cli.observations.points import Correspondences
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
-_FLAT = 1e-6  # largest extent of the third axis over that of the others
 _MEASURE = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
 
 
@@ -101,14 +100,12 @@ def unlike_axes(points: Correspondences) -> tuple[str, str] | None:
 
 def _axes(points: Correspondences) -> tuple[int, int] | None:
     """The axes of the plane of all points; None if it is not one, or with too few views or points."""
-    extent = np.ptp(points.world, axis=0)
-    order = np.argsort(extent)
-    if not (extent[order[0]] <= _FLAT * extent[order[1]] and extent[order[1]] > 0):
+    axes = np.flatnonzero(np.ptp(points.world, axis=0)).tolist()
+    few = points.n_views <= DETERMINE or np.bincount(points.view_index).min() < FEWEST
+    if few or len(axes) != 2:
         return None
-    if points.n_views <= DETERMINE or np.bincount(points.view_index).min() < FEWEST:
-        return None
-    first, second = sorted(order[1:].tolist())
-    extents = np.array([np.ptp(world[:, [first, second]], axis=0) for world in worlds_by_view(points)])
+    first, second = axes
+    extents = np.array([np.ptp(world[:, axes], axis=0) for world in worlds_by_view(points)])
     return (first, second) if (extents > 0).all() and points.pixels.std() > 0 else None
 
 
