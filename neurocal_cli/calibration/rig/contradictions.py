@@ -36,7 +36,6 @@ from neurocal_cli.camera.geometry import Array, median, rotation_vector
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 
-_TRIES = 2  # for the place and the kind of a change
 LeftOut = dict[tuple[int, str], str]  # views, by the index of the camera, and why
 
 
@@ -55,24 +54,25 @@ def without_contradictions(
             (fit, warnings) if moving is fit else adjusted(moving.problem, moving.state, refine_cameras, told)
         )
 
-    def held(whole: bool) -> set[tuple[int, str]]:
-        """Suspects that fit the others after all; of the whole, all if a cause in common is more probable."""
+    def held() -> set[tuple[int, str]]:
+        """Suspects that fit the others after all; all if a cause in common is more probable."""
         suspects = {view for view, why in left_out.items() if is_suspect(why)}
         if not suspects:
             return suspects
         named = {view: why for view, why in left_out.items() if view not in suspects}
         still = at_fit(_detached(problem, named, names), fit)
-        found = named_cause(still, names, free=of_rig(still))[0] if whole else None
+        found = named_cause(still, names, free=of_rig(still))[0]
         if found is not None and is_common(found, still, fit, len(suspects)):
             return suspects
         return suspects & set(_views(problem, fitting(still)))
 
-    def without(views: set[tuple[int, str]]) -> LeftOut:
-        return {view: why for view, why in left_out.items() if view not in views}
+    def taken(found: Named) -> LeftOut:
+        why = f"{TAKEN} {'after' if found.is_late else 'before'} {found.text}"
+        return dict.fromkeys(_views(problem, found.apart), why)
 
     fit, warnings = fitted()
-    if back := held(True):
-        left_out = without(back)
+    if back := held():
+        left_out = {view: why for view, why in left_out.items() if view not in back}
         fit, warnings = fitted()
     if fit.problem.motion is not None and (odd := _odd_views(fit)):
         left_out = left_out | dict.fromkeys(odd, UNSYNCHRONISED)
@@ -82,17 +82,12 @@ def without_contradictions(
         if found is None or found.cause not in TWO_GEOMETRIES:
             break
         before = left_out
-        for _ in range(_TRIES):
-            why = f"{TAKEN} {'after' if found.is_late else 'before'} {found.text}"
-            left_out = before | dict.fromkeys(_views(problem, found.apart), why)
-            fit, warnings = fitted()
-            again = seen_again(_detached(problem, before, names), fit, found)
-            if again.text == found.text:
-                break
-            found = again
-    if not all(map(is_suspect, left_out.values())) and (back := held(False)):
-        left_out = without(back)
+        left_out = before | taken(found)
         fit, warnings = fitted()
+        again = seen_again(_detached(problem, before, names), fit, found)
+        if again.text != found.text:  # its place or its kind
+            left_out = before | taken(again)
+            fit, warnings = fitted()
     return fit, left_out, warnings
 
 

@@ -69,13 +69,12 @@ def zooming(told: Told) -> Said:
 
 
 def stabilised(told: Told) -> Said:
-    """A centre of each view's own; not of interest if it moves less than it is known."""
+    """A centre of each view's own."""
     size = float(np.sqrt((told.found.amounts**2).mean()))
-    known = max(told.std["u0"], told.std["v0"])
     return (
         f"the image centre moves from view to view, by about {size * told.alpha:.2g} px, as image "
         "stabilisation moves it",
-        size if size * told.alpha > known else 0.0,
+        size,
     )
 
 
