@@ -376,7 +376,7 @@ def closest(contest: Contest | None, calibration: Calibration) -> str:
 
 def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tuple[int, str]:
     diagonal = image_diagonal(calibration.points)
-    told = Told(contest.lin, found, calibration.unit, diagonal, contest.std_of_poses)
+    told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal, contest.std_of_poses)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
     # Poses that rest on what is given have no other measure of their bias.

@@ -181,7 +181,13 @@ def _derivatives(
         J = np.zeros((len(view), 12 + K, 2, observed.shape[2]))
         derivatives(batches, chunk, state, J)
         # An effect at the observed places would contain the noise that it has to explain.
-        off = J[:, -1]  # those of points of another weight are about as small
+        off = J[:, -1].copy()
+        if batches.whitening is not None:
+            w = batches.whitening[chunk].swapaxes(0, 1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off[:, 1] /= w[2]
+                off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
+            off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
         by_pose, scale, local = J[:, POSE], views.scale[view][:, None, None], batches.local[chunk]
         back, tau = np.swapaxes(state.R[view], 1, 2), state.t[view]

@@ -9,7 +9,7 @@ same kind is taken off. Clean data hardly ever give more than `findings.LEVEL`. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Generic, TypeVar
 
@@ -57,6 +57,7 @@ class Told:
     lin: Linearised
     found: Estimate
     unit: str  # of the world
+    std: Mapping[str, float]  # reported standard deviations of the parameters
     diagonal: float  # of the image [px]
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
 

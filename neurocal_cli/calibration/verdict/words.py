@@ -69,12 +69,13 @@ def zooming(told: Told) -> Said:
 
 
 def stabilised(told: Told) -> Said:
-    """A centre of each view's own."""
+    """A centre of each view's own; not of interest if it moves less than it is known."""
     size = float(np.sqrt((told.found.amounts**2).mean()))
+    known = max(told.std["u0"], told.std["v0"])
     return (
         f"the image centre moves from view to view, by about {size * told.alpha:.2g} px, as image "
         "stabilisation moves it",
-        size,
+        size if size * told.alpha > known else 0.0,
     )
 
 
