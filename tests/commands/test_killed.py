@@ -93,6 +93,8 @@ def test_an_interrupt_while_workers_start_is_told_in_one_line(tmp_path: Path) ->
 def test_an_interrupt_is_no_death_by_signal(command: str, code: int, told: str) -> None:
     lines = (
         "import atexit, signal",
+        # Where the tests run under nohup, their processes ignore it.
+        f"signal.signal({int(_HANGUP)}, signal.SIG_DFL)",
         "from neurocal_cli import __main__, commands",
         f"def neurocal(prog_name): {command}",
         "commands.neurocal = neurocal",
