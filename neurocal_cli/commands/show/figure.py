@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, ACCENT = "#1f4e79", "#c0392b"
-_TITLE = 34  # characters, for which a panel of a page has room
+_TITLE = 32  # characters, for which a panel of a page has room
 
 
 def check_available() -> None:
