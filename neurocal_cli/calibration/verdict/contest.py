@@ -55,7 +55,8 @@ from neurocal_cli.camera.geometry import Array
 
 _MOST = 3  # causes at once, and rivals that are tried together with another one
 _MINOR = 0.03  # share of a cause's evidence below which a further one is what its linearisation leaves
-_FAR = 0.25  # the same of what was fitted or each view has, beside a target's shape, and of a lens's error
+_FAR = 0.25  # the same after a cause that was fitted, or that each view has in its own way
+_MUCH = 0.3  # share of the evidence beside the target's shape, or of the error of a lens, that counts
 _FAR_MORE = 2.0  # times the log evidence of an estimated target, or of given poses that are wrong
 
 
@@ -106,7 +107,7 @@ class Contest:
         known = [one for one in self.causes if not (one.rival.unknown or one.rival.effect in beside)]
         others = [one.evidence for one in known if not one.rival.of_board]
         told = sum(one.evidence for one in self.causes)
-        if max(others, default=0.0) > _FAR * told or first.rival.unknown or first.pattern == "one":
+        if max(others, default=0.0) > _MUCH * told or first.rival.unknown or first.pattern == "one":
             return worth * self.evidence + (LEVEL if first.rival.of_given else -LEVEL)
         # A shape that is far more probable than the found one is not open: no print is stretched by percents.
         return worth * told / _FAR_MORE if first.pattern == "all" else 0.0
@@ -260,7 +261,7 @@ def _fitted(lin: Linearised, one: Estimate, n: float) -> Estimate | None:
     if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > NEAR:
         member = one.weights > 0.5
         groups = [np.flatnonzero(member), np.flatnonzero(~member)]
-    elif (of_given or one.rival in RICHER_LENSES) and one.explained > _FAR:
+    elif (of_given or one.rival in RICHER_LENSES) and one.explained > _MUCH:
         free = np.append(lin.free, np.flatnonzero(one.rival.steps_at(lin).any(axis=1)))
         groups = [np.arange(views.n_views)]
     elif one.rival is ANOTHER_LENS and lin.alphas_free and state.model != "rich":

@@ -40,6 +40,7 @@ from neurocal_cli.observations.points import Correspondences
 
 # test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
+_FLAT = 1e-6  # of the second largest extent: the third one is rounding, as of Z in a file
 _MEASURE = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
 
 
@@ -100,7 +101,8 @@ def unlike_axes(points: Correspondences) -> tuple[str, str] | None:
 
 def _axes(points: Correspondences) -> tuple[int, int] | None:
     """The axes of the plane of all points; None if it is not one, or with too few views or points."""
-    axes = np.flatnonzero(np.ptp(points.world, axis=0)).tolist()
+    extent = np.ptp(points.world, axis=0)
+    axes = np.flatnonzero(extent > _FLAT * np.sort(extent)[1]).tolist()
     few = points.n_views <= DETERMINE or np.bincount(points.view_index).min() < FEWEST
     if few or len(axes) != 2:
         return None

@@ -88,6 +88,12 @@ def test_the_axes_of_the_board_may_be_any_two() -> None:
     assert (found.axis, found.other) == ("Y", "Z")
 
 
+def test_the_third_axis_may_be_rounded() -> None:
+    points = scaled(turned(1), [1 / 25.4, 1, 1], ALL)
+    rounded = moved(points, world=points.world + [0, 0, 1e-9] * np.sin(points.world[:, :1]))
+    assert "X is 25.4 times as long as given" in first_reason(rounded)
+
+
 def test_a_lens_does_not_hide_it() -> None:
     points = scaled(turned(3), [0.1, 1, 1], ALL)
     x = (points.pixels - CAMERA.A[:2, 2]) / 600.0
