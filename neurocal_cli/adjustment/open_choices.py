@@ -89,7 +89,8 @@ class SpreadOfOpen:
 
     E: Array  # (o, o) term to add to the estimated covariance of the open unknowns, 0 for those left out
     follow: Array  # (f, o) [T; 1], the response of all free unknowns to the open ones
-    probability: float  # posterior probability that any group is present
+    present: Array  # (o,) posterior probability that each is present
+    probability: float  # that any is
 
 
 @frozen_dataclass(eq=False)
@@ -194,7 +195,7 @@ def spread_of_open(arrow: Arrowhead, variance: float, prior: OpenPrior) -> Sprea
     E = _beyond(second, left, prior.left_out[prior.is_open])
     if not np.isfinite(E).all():
         return None
-    return SpreadOfOpen(E, follow, float(1.0 - weight[is_none].sum()))
+    return SpreadOfOpen(E, follow, weight @ (size > 0), float(1.0 - weight[is_none].sum()))
 
 
 def averaged(

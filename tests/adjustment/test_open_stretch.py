@@ -55,7 +55,7 @@ def only(which: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def known(arrow: Arrowhead, variance: float, m: int) -> SpreadOfOpen:
         found = spread_of_stretch(arrow, 1e12, m)
         assert found is not None
-        return SpreadOfOpen(np.diag(np.eye(2)[which]), found.follow, 1.0)
+        return SpreadOfOpen(np.diag(np.eye(2)[which]), found.follow, np.ones(2), 1.0)
 
     monkeypatch.setattr(open_choices, "spread_of_stretch", known)
 

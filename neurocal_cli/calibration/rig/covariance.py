@@ -21,6 +21,7 @@ derivatives by the rig's unknowns follow from those of each camera by the chain 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -31,9 +32,11 @@ from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import Prior, prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance, jackknife, not_smaller
-from neurocal_cli.adjustment.normal_equations import Covariance, solve_scaled
+from neurocal_cli.adjustment.normal_equations import Arrowhead, Covariance, solve_scaled
 from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.adjustment.open_choices import (
+    OpenCoefficients,
+    SpreadOfOpen,
     open_at_points,
     opened,
     spread_of_open,
@@ -170,29 +173,51 @@ def information_of_rig(target: Target, fit: RigFit) -> tuple[Information, Prior]
 
 def with_choice(found: Covariance, fit: RigFit) -> Covariance:
     """Add what the selection of each camera's distortion model leaves open to that of all shared unknowns."""
-    problem, before = fit.problem, fit.state
-    for side, place in enumerate(before.columns.cameras):
+    for _, _, arrow, spread, left_out in open_lenses(fit):
+        found = opened(found, np.flatnonzero(fit.free), arrow, spread, left_out)[0]
+    return found
+
+
+def open_lenses(
+    fit: RigFit,
+) -> Iterator[tuple[int, OpenCoefficients, Arrowhead, SpreadOfOpen, NDArray[np.bool_]]]:
+    """What the selection of each camera's distortion model leaves open, by the frames of all cameras.
+
+    These are the camera, its coefficients, the normal equations of the free unknowns with those that its
+    model left out, their spread, and which of all these were left out.
+    """
+    problem, state = fit.problem, fit.state
+    lenses: dict[int, OpenCoefficients] = {}
+    for side, place in enumerate(state.columns.cameras):
         calibration, free = problem.calibrations[side], fit.free[place]
         if not free.any():  # the common bundle adjustment did not change its coefficients
             continue
         points, choice = calibration.points, tuple(calibration.lens_choice)
-        alone = replace(calibration.state(points.view_names), k=before.cameras[side].k)
-        one = open_at_points(alone, points, free, choice)
-        if one is None:
-            continue
-        cameras = list(before.cameras)
-        cameras[side] = one.state(cameras[side])
-        first, last = fit.free[: place[0]], fit.free[place[-1] + 1 :]
-        all_free = np.flatnonzero(np.concatenate([first, one.free, last]))
-        its = int(first.sum()) + np.arange(int(one.free.sum()))
-        is_open, left_out = np.zeros((2, len(all_free)), dtype=bool)
-        is_open[its], left_out[its] = one.prior.is_open, one.prior.left_out
-        arrow = problem.normal(replace(before, cameras=tuple(cameras)))[0].only(all_free)
-        prior = replace(one.prior, is_open=is_open, left_out=left_out)
-        spread = spread_of_open(arrow, fit.variance, prior)
+        alone = replace(calibration.state(points.view_names), k=state.cameras[side].k)
+        if (one := open_at_points(alone, points, free, choice)) is not None:
+            lenses[side] = one
+    if not lenses:
+        return
+    cameras = [lenses[side].state(one) if side in lenses else one for side, one in enumerate(state.cameras)]
+    rich = replace(state, cameras=tuple(cameras))
+    normal, places = problem.normal(rich)[0], rich.columns.cameras
+    estimated = np.ones(rich.columns.n_shared, dtype=bool)
+    estimated[rich.columns.n_shared - problem.n_rig :] = fit.free[len(fit.free) - problem.n_rig :]
+    for side, place in enumerate(places):
+        if side in lenses:
+            estimated[place] = lenses[side].free
+            estimated[place[lenses[side].free]] = ~lenses[side].prior.left_out
+        else:
+            estimated[place] = fit.free[state.columns.cameras[side]]
+    for side, one in lenses.items():
+        with_its, is_open = estimated.copy(), np.zeros(len(estimated), dtype=bool)
+        with_its[places[side]] = one.free
+        is_open[places[side][one.free]] = one.prior.is_open
+        arrow, left_out = normal.only(np.flatnonzero(with_its)), ~estimated[with_its]
+        prior = replace(one.prior, is_open=is_open[with_its], left_out=left_out)
+        spread = spread_of_open(arrow, fit.variance / fit.worth, prior)
         if spread is not None:
-            found = opened(found, np.flatnonzero(fit.free), arrow, spread, left_out)[0]
-    return found
+            yield side, one, arrow, spread, left_out
 
 
 def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:

@@ -27,7 +27,7 @@ from neurocal_cli.calibration.rig.edges import (
 )
 from neurocal_cli.calibration.rig.frames import connected_frames
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.refinement import with_board
+from neurocal_cli.calibration.rig.refinement import with_board, with_missing_coefficients
 from neurocal_cli.calibration.rig.result import assembled
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import TOLD
@@ -68,6 +68,9 @@ def fit_rig(
         raise DegenerateGeometryError(f"{told}; remove them, or use --outliers reject")
     if (target := fit.problem.target) is not None:
         fit = with_board(fit, target)
+    if refine_cameras:
+        fit, of_lenses = with_missing_coefficients(fit, names)
+        warnings += of_lenses
     found, stretched = covariance_of(fit, target_kept)
     if target_kept and stretched:
         kept = tuple(replace(camera, target_stretched=stretched) for camera in fit.problem.calibrations)

@@ -7,6 +7,7 @@ shape with all other unknowns of the rig, moves the points there, and adjusts th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,15 +18,25 @@ from neurocal_cli.adjustment.board.prior import nearest_to_given
 from neurocal_cli.adjustment.board.system import system_of
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.monotonic_fit import ROUNDS, TIE, next_penalty, told_of_fold
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, free_parameters, rig_problem
-from neurocal_cli.calibration.rig.covariance import information_of_rig
+from neurocal_cli.calibration.rig.adjust import (
+    RigFit,
+    adjust_rig,
+    free_parameters,
+    is_significant,
+    rig_problem,
+    scatter,
+)
+from neurocal_cli.calibration.rig.covariance import information_of_rig, open_lenses
 from neurocal_cli.calibration.rig.problem import RigProblem, RigState
 from neurocal_cli.calibration.rig.result import intrinsics_of, non_monotonic_sides
-from neurocal_cli.calibration.verdict.findings import CONTRADICTION
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION, LEVEL
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.observations.target import Target, scale_of_points
 
 _ROUNDS = 6
+_SHOWN = 1.0 / (1.0 + math.exp(-LEVEL))  # probability of a coefficient, by the level of all causes
 _SETTLED = 0.05  # standard deviations; moves of all points that are smaller end the rounds
 
 
@@ -88,6 +99,35 @@ def with_board(fit: RigFit, target: Target) -> RigFit:
         if move < _SETTLED:
             return fit
     return fit
+
+
+def with_missing_coefficients(fit: RigFit, names: Sequence[str]) -> tuple[RigFit, list[str]]:
+    """The fit with coefficients of lenses that it shows and the cameras alone did not; and its warnings.
+
+    The poses of a camera's own views take in most of p1 and p2, and those of a rig cannot. What one camera
+    lacks moves the others, so where one shows p1 and p2, which all lenses have, all take them. Frames that
+    contradict each other even then tell nothing of lenses, and the fit stays as it is.
+    """
+    calibrations, lenses = list(fit.problem.calibrations), list(fit.state.cameras)
+    shown: dict[int, set[str]] = {}
+    for side, one, _, spread, _ in open_lenses(fit):
+        every = np.append(INTRINSIC_NAMES, coefficient_names(one.model))
+        likely = every[one.free][one.prior.is_open][spread.present > _SHOWN]
+        shown[side] = {*coefficient_names(lenses[side].model), *likely.tolist()}
+    of_all = {"p1", "p2"} & set().union(*shown.values())
+    for side, own in shown.items():
+        model = next((m for m in POLYNOMIAL_MODELS if own | of_all <= set(coefficient_names(m))), "")
+        if model and model != lenses[side].model:
+            k = np.zeros(len(coefficient_names(model)))
+            k[: len(lenses[side].k)] = lenses[side].k
+            calibrations[side] = replace(calibrations[side], distortion_model=model, distortion=k)
+            lenses[side] = replace(lenses[side], model=model, k=k)
+    if all(new is old for new, old in zip(lenses, fit.state.cameras, strict=True)):
+        return fit, []
+    problem = rig_problem(calibrations, [observed.view for observed in fit.problem.observations])
+    problem = replace(problem, motion=fit.problem.motion)
+    found, told = adjusted(problem, replace(fit.state, cameras=tuple(lenses)), True, names)
+    return (fit, []) if is_significant(*scatter(found)) else (found, told)
 
 
 def _moved(target: Target, fit: RigFit) -> Target | None:
