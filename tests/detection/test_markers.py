@@ -198,11 +198,32 @@ def test_another_dictionary_is_named() -> None:
         detect_points(taken(scene, 1).image, wrong)
 
 
-def test_markers_that_contradict_the_columns_are_refused() -> None:
-    scene = marked_scene(plane_of(CHARUCO), 1)
-    wrong = Board((plane_of("charuco:7x5:40:30:DICT_4X4_50"),))
+@pytest.mark.parametrize(
+    ("form", "wrong", "place"),
+    [
+        (CHARUCO, "charuco:7x5:40:30:DICT_4X4_50", {}),
+        # Half of the markers in view agree with a row less wide.
+        (
+            "charuco:8x4:40:28:DICT_5X5_50",
+            "charuco:7x4:40:28:DICT_5X5_50",
+            {"square": 52.0, "shift": (60.0, 40.0)},
+        ),
+    ],
+)
+def test_markers_that_contradict_the_columns_are_refused(
+    form: str, wrong: str, place: dict[str, object]
+) -> None:
+    image = taken(marked_scene(plane_of(form), 1, **place), 1, 4).image  # type: ignore[arg-type]
     with pytest.raises(NoBoardError, match="as if it had another number of columns"):
-        detect_points(taken(scene, 1).image, wrong)
+        detect_points(image, Board((plane_of(wrong),)))
+
+
+def test_tags_that_are_seen_with_the_square_at_a_corner_are_where_the_board_has_them() -> None:
+    scene = marked_scene(plane_of("aprilgrid:4x3:40:0.2:tag16h5"), 0, tilt=60.0, psf=1.5)
+    picture = taken(scene, 0, 3)
+    error, _ = errors_of(detect_points(picture.image, scene.board, "vertices"), picture)
+    assert len(error) >= 44
+    assert np.abs(error).max() < 0.3  # the blur joins the edges on both sides of a gap
 
 
 @pytest.mark.parametrize("turns", range(4))

@@ -31,6 +31,8 @@ from neurocal_cli.observations.marked_cells import Cells, Print, marked_cells, p
 
 _NEAR = 4.5  # squares between markers that are compared
 _AGREE, _AGREE_PX = 0.03, 0.6  # squares and px; rms error of two markers in one homography
+_WITHIN = 0.3  # squares from the middle of a marker; half of the shortest side
+_MISPLACED = 0.3  # markers at the places of others, over those at their own
 _AROUND = 2.3  # squares; markers that predict a vertex
 _REACH = 1.6  # squares between a vertex and the nearest marker or vertex that predicts it
 _MOVED, _MOVED_PX = 0.12, 1.2  # squares and px; greatest distance between prediction and saddle point
@@ -58,7 +60,7 @@ class Placed:
     cells: Cells
     at: NDArray[np.intp]  # (N,) their positions among the cells
     ground: Array  # (N, 4, 2) [squares] their corners on the board
-    read: int  # how many of the board's markers were read
+    read: Marks  # also those that do not agree
     unsure: bool = False  # whether as many markers agree in another print
 
 
@@ -76,10 +78,56 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
             continue
         if best is None or len(kept) > len(best.at):
             # Of a blurred marker, two outlines may be read.
-            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], len(np.unique(at)))
+            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], some)
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
-    return best
+    return None if best is None else _completed(plane, best)
+
+
+def _completed(plane: Plane, placed: Placed) -> Placed:
+    """With the markers of which three corners agree with those of the two nearest, which give the fourth.
+
+    A quadrangle may reach beyond a corner of a tag, to the end of the square at it.
+    """
+    rest = placed.read.only(~np.isin(placed.read.number, placed.marks.number))
+    if not len(rest):
+        return placed
+    at = placed.cells.of(rest.number)
+    ground, known = plane.spread(placed.cells.corners[at]), placed.ground
+    away = np.abs(ground.mean(axis=1)[:, None] - known.mean(axis=1)).max(axis=2)
+    near = np.argsort(away, axis=1)[:, :2]
+    both = np.concatenate([ground, known[near].reshape(-1, 8, 2)], axis=1)
+    pixels = np.concatenate([rest.corners, placed.marks.corners[near].reshape(-1, 8, 2)], axis=1)
+    without = 1.0 - np.eye(4, 12)  # in turn, each of its corners
+    fourfold = np.repeat(both, 4, axis=0)
+    H = homographies(fourfold, np.repeat(pixels, 4, axis=0), np.tile(without, (len(at), 1)))
+    told = homography_at(H, fourfold).reshape(-1, 4, 12, 2)
+    error = np.sqrt(((told - pixels[:, None]) ** 2).sum(axis=3) @ without.T / 11)
+    error = np.diagonal(error, axis1=1, axis2=2)
+    least, every = error.argmin(axis=1), np.arange(len(at))
+    side = np.sqrt(_area(placed.marks.corners[near[:, 0]]) / _area(known[near[:, 0]]))
+    good = (error[every, least] < _AGREE * side + _AGREE_PX) & (away[every, near[:, 1]] < _NEAR)
+    corners = rest.corners.copy()
+    corners[every, least] = told[every, least, least]
+    marks = Marks(rest.number, corners, rest.dictionary).only(good).with_others(placed.marks)
+    order = np.concatenate([at[good], placed.at])
+    return replace(placed, marks=marks, at=order, ground=plane.spread(placed.cells.corners[order]))
+
+
+def are_misplaced(plane: Plane, placed: Placed, size: tuple[int, int]) -> bool:
+    """Whether many markers were read where the board has others, as if its rows had another length.
+
+    Their middles tell that, even where a quadrangle reaches beyond a corner.
+    """
+    known, pixels = placed.ground.reshape(-1, 2), placed.marks.corners.reshape(-1, 2)
+    middle = plane.spread(placed.cells.corners).mean(axis=1)
+    start, step = predicted(middle, known, pixels, flattening_of(known, pixels, size))
+    off = np.linalg.norm(placed.read.corners.mean(axis=1)[:, None] - start, axis=2)
+    nearest = np.nan_to_num(off, nan=np.inf).argmin(axis=1)
+    own = nearest == placed.cells.of(placed.read.number)
+    side = np.sqrt(np.abs(np.linalg.det(step[nearest])))
+    others = ~own & (np.take_along_axis(off, nearest[:, None], axis=1)[:, 0] < _WITHIN * side)
+    return bool(others.sum() > _MISPLACED * own.sum())
 
 
 def read_together(plane: Plane, dictionary: str, grid: Grid, image: Image) -> Marks | None:

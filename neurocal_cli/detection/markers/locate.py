@@ -20,6 +20,7 @@ from neurocal_cli.detection.markers.lattice import (
     LEAST_AGREEMENT,
     Placed,
     agreement,
+    are_misplaced,
     corners_of_tags,
     find_vertices,
     place,
@@ -47,7 +48,6 @@ from neurocal_cli.observations.markers import DICTIONARIES, code_count
 _ENOUGH = 4  # markers that are no chance
 _MOST = 0.5  # share of the markers after which no other scale is tried
 _WITH_SQUARES = 0.5  # share of the corners of tags that are vertices if there are squares at them
-_PLACED = 0.5  # least share of the markers that were read that are where the board has them
 # Distance of markers as read over the described one: 0.97 to 1.06 (once 1.17) in 60 views, as the sides of
 # markers are read too small.
 _SPACED = 0.95, 1.2
@@ -79,7 +79,7 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
         if isinstance(plane, TagPlane) and plane.downwards:
             _check_spacing(plane, placed.marks)
         found, agree = _vertices(plane, placed, light), len(np.unique(placed.at))
-        misplaced = agree < _PLACED * placed.read
+        misplaced = are_misplaced(plane, placed, (grey.shape[1], grey.shape[0]))
         if found is None and (agree < _ENOUGH or not misplaced or placed.unsure):
             read = max(read, agree)
             continue
