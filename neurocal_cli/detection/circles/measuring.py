@@ -60,6 +60,7 @@ from neurocal_cli.observations.board_kinds import CirclePlane
 
 _REACH = 4.0  # sigma on both sides of the outline
 _ROUGHLY = 1.5  # of that, for a first selection
+_TINY = 1e-9
 _ROOM = 0.5  # of the distance to the next circle; farther pixels may show it
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -88,22 +89,27 @@ def outline_pixels(
     blur: float,
     band: tuple[float, float],
     shading: Shading | None,
+    most: int,
 ) -> CirclePixels:
-    """Gather the pixels around the outlines of circles at places (N, 2), padded to the same number.
+    """Gather about `most` of the pixels around the outline of each circle at places (N, 2), padded.
 
     `radius` and the least and greatest distance of pixels from the centres, the `band`, are in the unit of
     the places, `blur` in px.
     """
     samples = np.concatenate([[[0.0, 0.0]], *(share * radius * _CIRCLE for share in _RADII)])
     seen, reach = at.at(places[:, None] + samples), _REACH * blur
-    middle = seen[:, 0]
+    middle, inverse = seen[:, 0], LocalInverse.of(seen, samples)
     outline = seen[:, 1 + 2 * len(_ANGLES) : 1 + 3 * len(_ANGLES)]
-    point, d, normal, bend, rho, near = _distances(seen, samples, radius, _around(outline, reach), reach)
+    window, inside = _around(outline, reach, most)
+    point, d, normal, bend, rho, near = _distances(
+        inverse, middle, radius, inverse.from_centre(window), inside, reach
+    )
     near &= (np.abs(d) < reach) & (rho > band[0]) & (rho < band[1])
-    near &= (point >= 0).all(axis=2) & (point < image.shape[::-1]).all(axis=2)
+    pixel = np.rint(point + inverse.centre[..., None])
+    near &= (pixel >= 0).all(axis=1) & (pixel < np.array(image.shape[::-1])[:, None]).all(axis=1)
     index, used = packed(near)
     u, v, d, n_u, n_v, bend = (
-        x.reshape(-1)[index] for x in (*np.moveaxis(point, 2, 0), d, *np.moveaxis(normal, 2, 0), bend)
+        x.reshape(-1)[index] for x in (*pixel.swapaxes(0, 1), d, *normal.swapaxes(0, 1), bend)
     )
     value: Single = image[np.where(used, v, 0).astype(int), np.where(used, u, 0).astype(int)]
     gain: Single = np.ones_like(value)
@@ -114,8 +120,8 @@ def outline_pixels(
     return CirclePixels(value, gain, np.ones_like(value), used.astype(np.float32), *columns)
 
 
-def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Pixels (N, M, 2) along each outline (N, K, 2), padded to the same number, and a mask (N, M) of them."""
+def _around(outline: Array, reach: float, most: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels (N, M, 2) along each outline (N, K, 2), about `most` of each, padded, and a mask (N, M)."""
     low, high = np.floor(outline.min(axis=1) - reach), np.ceil(outline.max(axis=1) + reach) + 1
     width, height = (high - low).max(axis=0).astype(int).tolist()
     away = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
@@ -126,50 +132,51 @@ def _around(outline: Array, reach: float) -> tuple[Array, NDArray[np.bool_]]:
     for mask, line in zip(along, np.rint(outline - low[:, None]).astype(np.int32), strict=True):
         cv2.polylines(mask, [line], True, 1, thickness)
     near = (away < (high - low)[:, None]).all(axis=2) & (along.reshape(len(low), -1) > 0)
+    stride = max(1, np.count_nonzero(near) // (most * len(low)))
     index, used = packed(near)
-    return low[:, None] + away[index % len(away)], used
+    return low[:, None] + away[index[:, ::stride] % len(away)], used[:, ::stride]
 
 
 def _distances(
-    seen: Array,
-    samples: Array,
+    inverse: LocalInverse,
+    middle: Array,
     radius: float,
-    window: tuple[Array, NDArray[np.bool_]],
+    point: Single,
+    inside: NDArray[np.bool_],
     reach: float,
-) -> tuple[Array, Array, Array, Array, Array, NDArray[np.bool_]]:
+) -> tuple[Single, Single, Single, Single, Single, NDArray[np.bool_]]:
     """Pixels near outlines: themselves, distance, normal, half curvature, radius on the board, and a mask.
 
-    The map's inverse is a polynomial through its samples around the circle. All arrays are padded to the same
-    number of pixels, which the mask tells from the padding.
+    Points are relative to the centres of the map's inverse. All arrays are padded to the same number of
+    pixels, which the mask tells from the padding.
     """
-    inverse = LocalInverse.of(seen, samples)
 
-    def nearer(foot: Array, point: Array) -> tuple[Array, Array, Array]:
+    def nearer(foot: Single, point: Single) -> tuple[Single, Single, Single]:
         """Distance from the outline, normal at a foot near it, and the radius there."""
         a, b, au, av, bu, bv = inverse.at(foot)
-        rho = np.maximum(np.hypot(a, b), 1e-9)
-        slope = np.stack([a * au + b * bu, a * av + b * bv], axis=-1) / rho[..., None]
-        steep = np.maximum(np.hypot(slope[..., 0], slope[..., 1]), 1e-9)
-        n = slope / steep[..., None]
-        return ((point - foot) * n).sum(axis=2) + (rho - radius) / steep, n, rho
+        rho = np.maximum(np.hypot(a, b), _TINY)
+        slope = np.stack([a * au + b * bu, a * av + b * bv], axis=1)
+        steep = np.maximum(np.hypot(slope[:, 0], slope[:, 1]), _TINY)
+        n = slope / steep[:, None]
+        return ((point - foot) * n).sum(axis=1) + (rho - radius) * rho / steep, n, rho
 
-    point, inside = window
     d, n, rho = nearer(point, point)
     near = inside & (np.abs(d) < _ROUGHLY * reach)
     index, used = packed(near)
     d, rho = (x.reshape(-1)[index] for x in (d, rho))
-    n, point = (x.reshape(-1, 2)[index] for x in (n, point))
+    n, point = (np.take_along_axis(x, index[:, None] % x.shape[2], axis=2) for x in (n, point))
     foot = point
     for _ in range(2):
-        foot = point - d[..., None] * n
+        foot = point - d[:, None] * n
         d, n, _ = nearer(foot, point)
     # Curvature of an ellipse with the shape of the map at the centre: M maps pixels to the board.
-    M = np.stack(inverse.at(seen[:, :1])[2:], axis=-1).reshape(-1, 2, 2)
+    centre = inverse.from_centre(middle[:, None])
+    M = inverse.at(centre)[2:].swapaxes(0, 1).reshape(-1, 2, 2)
     G = M.swapaxes(1, 2) @ M / radius**2
-    gradient = (foot - seen[:, :1]) @ G
-    length = np.maximum(np.hypot(gradient[..., 0], gradient[..., 1]), 1e-12)
-    tangent = np.stack([-gradient[..., 1], gradient[..., 0]], axis=-1) / length[..., None]
-    curvature = ((tangent @ G) * tangent).sum(axis=2) / length
+    gradient = G @ (foot - centre)
+    length = np.maximum(np.hypot(gradient[:, 0], gradient[:, 1]), _TINY)
+    tangent = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1) / length[:, None]
+    curvature = ((G @ tangent) * tangent).sum(axis=1) / length
     return point, d, n, 0.5 * np.clip(curvature, 0, 2), rho, used
 
 
@@ -178,6 +185,7 @@ _ROUNDS, _MOST_ROUNDS = 3, 8
 _SETTLED = (
     0.5  # standard deviations of a centre, rms movement of the map after which no other round is needed
 )
+_FEW = 1000  # pixels of a circle, enough for the first rounds
 _STEPS = 8  # Gauss-Newton steps
 _FIRST_BLUR = 1.2  # px
 _LOOSE = 0.3  # relative prior standard deviation of levels and blur
@@ -205,7 +213,8 @@ def measure_circles(
     blur, shading, some = _FIRST_BLUR, None, np.ones(len(places), dtype=np.bool_)
     for done in range(1, _MOST_ROUNDS + 1):
         band = _band(light, found.map, places, radius, _ROOM * apart)
-        pixels = outline_pixels(light, found.map, places, radius, blur, band, shading)
+        most = _FEW if done < _ROUNDS else light.size
+        pixels = outline_pixels(light, found.map, places, radius, blur, band, shading, most)
         fit = _fitted(pixels, blur, floor, shading is not None and shading.has_borders)
         sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
         if sharpening is not None:

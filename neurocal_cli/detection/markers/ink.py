@@ -146,7 +146,7 @@ def with_ink(raw: GridImage, ink: Ink, look: Appearance, most: float) -> GridIma
     pixels, used = _near_edges(result, ink, corners, blur[:, :2].max(axis=1), len(ink.lines) == 2)
     if not used.any():
         return known
-    a, b, *slopes = inverse.at(pixels)
+    a, b, *slopes = inverse.at(inverse.from_centre(pixels))
     blurred = _Blurred.of(slopes, blur, look.shift, look.tails)
     change = blurred.pattern(a, b, ink.lines, ink.inner)
     u, v = pixels[used].T.astype(np.intp)
