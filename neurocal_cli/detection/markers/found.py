@@ -254,8 +254,6 @@ _USUAL, _SIMPLE = 20, 12  # denominators of usual ratios, and the largest one of
 _CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.012
 _CLOSE_ROUGH = 0.015  # of one from the corners of the markers
 _DIGITS = 3  # of other ratios
-_SHRUNK = (0.92, 0.88, 0.96, 1.0, 0.84, 0.8)  # sides of tags that are tried, over those that were read
-_LEAST = 0.04  # spacing
 _ALONG = np.linspace(0.35, 0.65, 7)  # of a cell's side, where the light is looked at
 _ACROSS = np.linspace(-0.15, 0.5, 53)  # of a cell, from its side inwards
 _BORDER = 0.6  # of the width of a marker's border that is looked at
@@ -273,11 +271,9 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
     """
     markers = plane.markers
     assert markers is not None
+    seen = [picture for image, marks in images if (picture := _pictured(plane, image, marks)) is not None]
     if isinstance(plane, TagPlane):
-        tags = [part for image, marks in images if (part := _best(plane, image, marks)) is not None]
-        spacing = median(
-            np.array([_spacing(replace(plane, spacing=one), pixels) for one, (pixels, _, _) in tags])
-        )
+        spacing = median(np.array([_spacing(plane, pixels) for pixels, _, _ in seen]))
         if not np.isfinite(spacing):
             size = "x".join(map(str, plane.tags))
             raise NoBoardError(
@@ -285,10 +281,9 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
                 "their spacing is not told; describe the board by --board, for example "
                 f"aprilgrid:{size}:88:0.3"
             )
-        border = _border(plane, [picture for _, picture in tags])
+        border = _border(plane, seen)
         return replace(plane, spacing=simple(spacing, _CLOSE_SPACING), border=border)
     rough, width = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
-    seen = [picture for image, marks in images if (picture := _pictured(plane, image, marks)) is not None]
     found = [_side(picture, rough, width) for picture in seen]
     side, blur = (median(np.array([one[k] for one in found])) for k in (0, 1))
     if np.isfinite(side):
@@ -296,21 +291,6 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
     else:
         ratio = simple(rough, _CLOSE_ROUGH)
     return replace(plane, markers=replace(markers, side=ratio * plane.square))
-
-
-def _best(plane: TagPlane, image: NDArray[np.generic], marks: Marks) -> tuple[float, _Picture] | None:
-    """The spacing with which most vertices are found, and these; squares at its corners may shrink a tag."""
-    best: tuple[float, _Picture] | None = None
-    most = 0
-    for shrunk in _SHRUNK:
-        spacing = (1 + plane.spacing) * shrunk - 1
-        part = _pictured(replace(plane, spacing=spacing), image, marks) if spacing > _LEAST else None
-        count = 0 if part is None else int(np.isfinite(part[0][..., 0]).sum())
-        if part is not None and count > most:
-            best, most = (spacing, part), count
-        if most == plane.cols * plane.rows:
-            break
-    return best
 
 
 def _border(plane: TagPlane, pictures: Sequence[_Picture]) -> int:

@@ -35,7 +35,9 @@ from neurocal_cli.detection.fitting.strips import GridImage, Single
 _REACH = 3.7
 _FITTED, _FITTED_PX = 5.0, 2.0  # sigma and px from an edge, beyond which fits use no pixels
 _SLACK = 1.0  # px, for what the homographies of cells leave out
-_SAMPLES = 6  # along the sides of a cell
+_WIDER = 1.1  # blur of pixels that are chosen, over that of the first look
+# Of the map in a cell; the next ones may be of another size.
+_SAMPLES = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 6)]), axis=-1).reshape(-1, 2)
 _TERMS = ((0.02, 1), (0.1, 2), (0.3, 4), (0.5, 7), (1.0, 12))  # of the series up to a correlation
 _MOST_RHO = 0.9
 _SIGNS = (-1, 1)
@@ -123,38 +125,46 @@ class Appearance:
         return float(np.nanmin(width / self.blur[:, :2].max(axis=1), initial=np.inf))
 
 
-def with_ink(raw: GridImage, ink: Ink, look: Appearance, most: float) -> GridImage:
-    """Add to an image what patterns add to the light near the edges of their cells, and NaN within patterns.
+@frozen_dataclass(eq=False)
+class InkedPixels:
+    """Pixels of an image near the edges of cells, which their patterns reach."""
 
-    `most` is the change of the light, in half contrasts, beyond which a pixel is left out.
-    """
-    result = raw.image.astype(np.float32)
-    light = np.zeros(result.shape, dtype=np.float32)
-    known = replace(raw, image=result, ink=light)
-    ticks = np.linspace(0, 1, _SAMPLES)  # the next cells may be of another size
-    samples = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    seen = look.map.at(ink.cell[:, None] + samples)
-    shown = np.asarray(np.isfinite(seen).all(axis=(1, 2)) & ink.inner.any(axis=(1, 2)))
-    if not shown.any():
-        return known
-    ink, blur = ink.only(shown), look.blur[shown]
-    look = replace(look, blur=blur)
-    inverse = LocalInverse.of(seen[shown], samples)
-    corners = look.map.at(ink.cell[:, None] + _CORNERS)
-    if ink.border * look.clearance(ink) > _REACH:
-        ink = ink.filled
-    pixels, used = _near_edges(result, ink, corners, blur[:, :2].max(axis=1), len(ink.lines) == 2)
-    if not used.any():
-        return known
-    a, b, *slopes = inverse.at(inverse.from_centre(pixels))
-    blurred = _Blurred.of(slopes, blur, look.shift, look.tails)
-    change = blurred.pattern(a, b, ink.lines, ink.inner)
-    u, v = pixels[used].T.astype(np.intp)
-    change = change[used].astype(np.float32)
-    np.add.at(light, (v, u), change)  # some pixels are near the edges of two cells
-    left = np.abs(change) > most
-    result[v[left], u[left]] = np.nan
-    return known
+    raw: GridImage  # NaN at other pixels within a pattern, which are too far from the edges for the fits
+    ink: Ink  # of the N cells that are shown
+    shown: NDArray[np.bool_]  # which of the cells these are
+    pixels: Array  # (N, M, 2), padded
+    used: NDArray[np.bool_]  # (N, M) False for the padding
+
+    @classmethod
+    def of(cls, raw: GridImage, ink: Ink, look: Appearance) -> InkedPixels:
+        """Choose the pixels by a first look, which may see less blur than later ones."""
+        result = raw.image.astype(np.float32)
+        seen = look.map.at(ink.cell[:, None] + _SAMPLES)
+        shown = np.asarray(np.isfinite(seen).all(axis=(1, 2)) & ink.inner.any(axis=(1, 2)))
+        ink, look = ink.only(shown), replace(look, blur=look.blur[shown])
+        if ink.border * look.clearance(ink) > _REACH:
+            ink = ink.filled
+        corners, sigma = look.map.at(ink.cell[:, None] + _CORNERS), _WIDER * look.blur[:, :2].max(axis=1)
+        pixels, used = _near_edges(result, ink, corners, sigma, len(ink.lines) == 2)
+        return cls(replace(raw, image=result), ink, shown, pixels, used)
+
+    def under(self, look: Appearance, most: float) -> GridImage:
+        """The image with what patterns add to its light, and NaN where they change it by more than `most`.
+
+        `most` is in half contrasts.
+        """
+        result = self.raw.image.astype(np.float32)
+        light = np.zeros(result.shape, dtype=np.float32)
+        if self.used.any():
+            inverse = LocalInverse.of(look.map.at(self.ink.cell[:, None] + _SAMPLES), _SAMPLES)
+            a, b, *slopes = inverse.at(inverse.from_centre(self.pixels))
+            blurred = _Blurred.of(slopes, look.blur[self.shown], look.shift, look.tails)
+            change = blurred.pattern(a, b, self.ink.lines, self.ink.inner)[self.used]
+            u, v = self.pixels[self.used].T.astype(np.intp)
+            np.add.at(light, (v, u), change)  # some pixels are near the edges of two cells
+            left = np.abs(change) > most
+            result[v[left], u[left]] = np.nan
+        return replace(self.raw, image=result, ink=light)
 
 
 def _near_edges(
@@ -174,8 +184,8 @@ def _near_edges(
         if (high <= low).any():
             parts.append(np.zeros((0, 2), dtype=np.intp))
             continue
-        u, v = np.arange(low[0], high[0], dtype=float), np.arange(low[1], high[1], dtype=float)[:, None]
-        a, b, w = (row[0] * u + row[1] * v + row[2] for row in H)
+        u, v = np.arange(low[0], high[0], dtype=np.float32), np.arange(low[1], high[1], dtype=np.float32)
+        a, b, w = (float(x) * u + float(y) * v[:, None] + float(one) for x, y, one in H)
         a, b = a / w, b / w
         side_a, side_b = np.hypot(*(box[1] - box[0])), np.hypot(*(box[3] - box[0]))
         # Distances between opposite sides.
@@ -193,7 +203,7 @@ def _near_edges(
         result[low[1] : high[1], low[0] : high[0]][reached & ~near] = np.nan
         parts.append(np.argwhere(near)[:, ::-1] + low)
     count = np.array([len(part) for part in parts])
-    used = np.arange(max(int(count.max()), 1)) < count[:, None]
+    used = np.arange(max(int(count.max(initial=1)), 1)) < count[:, None]
     pixels = np.repeat(corners.mean(axis=1)[:, None], used.shape[1], axis=1)
     pixels[used] = np.concatenate(parts)
     return pixels, used
@@ -203,8 +213,8 @@ def _near_edges(
 class _Blurred:
     """Blur at M pixels of each of N cells, in the coordinates of the cell."""
 
-    a: Array  # (N, M) standard deviation along a
-    b: Array
+    a: Single  # (N, M) standard deviation along a
+    b: Single
     rho: Array  # (N,) correlation
     shift_a: Array  # (N,) displacement of edges towards the light side
     shift_b: Array
@@ -217,9 +227,11 @@ class _Blurred:
         across_a, across_b = np.hypot(au, av), np.hypot(bu, bv)
         rho = np.clip(blur[:, 2], -_MOST_RHO, _MOST_RHO)
         shifts = shift * across_a.mean(axis=1), shift * across_b.mean(axis=1)
-        return cls(blur[:, :1] * across_a, blur[:, 1:2] * across_b, rho, *shifts, tails[None])
+        return cls(
+            _single(blur[:, :1]) * across_a, _single(blur[:, 1:2]) * across_b, rho, *shifts, tails[None]
+        )
 
-    def pattern(self, a: Array, b: Array, lines: Array, cells: Array) -> Array:
+    def pattern(self, a: Single, b: Single, lines: Array, cells: Array) -> Real:
         """Blurred light (N, M) of cells (N, n, n) ``[b, a]`` between lines along both axes, 0 around them."""
         signs = np.repeat(_SIGNS, len(lines))
         moved_a, moved_b = (
@@ -229,14 +241,14 @@ class _Blurred:
 
     def _profile(self, z: Real) -> tuple[Real, Real]:
         """Profile of an edge and the normal density at distances in sigma."""
-        value, _, density = profile(z.reshape(1, -1), self.tails)
+        value, _, density = profile(z.reshape(1, -1), _single(self.tails))
         return value.reshape(z.shape), density.reshape(z.shape)
 
-    def _sum(self, a: Array, b: Array, lines_a: Array, lines_b: Array, weights: Array) -> Array:
+    def _sum(self, a: Single, b: Single, lines_a: Array, lines_b: Array, weights: Array) -> Real:
         """Sum over corners ``weights[:, j, i]`` at (lines_a[:, i], lines_b[:, j])."""
         W = _single(weights)
         za, zb = (
-            _single((x[..., None] - lines[:, None]) / s[..., None])
+            (x[..., None] - _single(lines)[:, None]) / s[..., None]
             for x, lines, s in ((a, lines_a, self.a), (b, lines_b, self.b))
         )
         (ea, pa), (eb, pb) = (self._profile(z) for z in (za, zb))
@@ -245,13 +257,13 @@ class _Blurred:
         rho = _single(self.rho[:, None])
         power = np.ones_like(rho)
         # Derivatives of Phi: (-1)^(n-1) He_(n-1) phi; the signs cancel in the products.
-        before_a, now_a, before_b, now_b = np.zeros_like(za), pa, np.zeros_like(zb), pb
+        before_a, now_a, before_b, now_b = 0 * pa, pa, 0 * pb, pb
         for n in range(1, count + 1):
             power *= rho / np.float32(n)
             total += power * ((now_b @ W) * now_a).sum(axis=2)
             before_a, now_a = now_a, za * now_a - (n - 1) * before_a
             before_b, now_b = now_b, zb * now_b - (n - 1) * before_b
-        return np.asarray(total, dtype=float)
+        return total
 
 
 def _displaced(cells: Array) -> Array:

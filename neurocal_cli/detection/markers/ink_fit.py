@@ -9,7 +9,6 @@ codes, and the levels that suit it best.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 
@@ -37,7 +36,7 @@ from neurocal_cli.detection.fitting.shading import (
 )
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import GridImage, Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.markers.ink import Appearance, Ink, with_ink
+from neurocal_cli.detection.markers.ink import Appearance, Ink, InkedPixels
 from neurocal_cli.detection.medians import upper_median
 
 # Greatest change of the light by the ink, in half contrasts, of pixels that are used in the first fit, and in
@@ -71,13 +70,13 @@ def fit_with_ink(raw: GridImage, ink: Ink, undo: bool = True) -> GridFit:
     if sharpening is not None:
         return fit_with_ink(sharpening.undone(raw, 2 * raw.grid.square), ink, undo=False)
     sigma = upper_median(look.blur[:, 0])
-    inked = with_ink(raw, ink, look, _FIRST_MOST)
-    fitted = fit_from(inked, mapped, sigma, shading, levels, max(noise, raw.floor))
+    inked = InkedPixels.of(raw, ink, look)
+    fitted = fit_from(inked.under(look, _FIRST_MOST), mapped, sigma, shading, levels, max(noise, raw.floor))
     look = _look_of(fitted, ink)
     gap = ink.gap * look.clearance(ink)
     rounds = next((all_of for limit, all_of in _MOST if gap > limit), _MOST_NEAR)
     for most in rounds:
-        fitted = fit_again(with_ink(raw, ink, look, most), fitted)
+        fitted = fit_again(inked.under(look, most), fitted)
         look = look.halfway_to(_look_of(fitted, ink))
     return fitted
 
@@ -139,15 +138,15 @@ def _by_pixels(
     free = np.array([OFFSET, MEAN, CONTRAST]) % edges.shape[1]
     shape = ProfileShape(np.zeros((len(edges), 2)), np.zeros(RESPONSE_TERMS))
     usual, reach = upper_median(edges[:, BLUR]), REACH * edges[:, BLUR]
+    inked = InkedPixels.of(raw, ink, look)
 
     def tried(sigma: float) -> tuple[float, Appearance, Array]:
         values = edges.copy()
         values[:, BLUR] = sigma
         blur = np.column_stack([np.full((len(ink.cell), 2), sigma), look.blur[:, 2]])
         own = replace(look, blur=blur, shift=0.0)
-        pixels = edge_pixels(
-            with_ink(raw, ink, own, _ALL), lines, values[:, BLUR], shading, reach, usual_stride(lines)
-        )
+        light = inked.under(own, _ALL)
+        pixels = edge_pixels(light, lines, values[:, BLUR], shading, reach, usual_stride(lines))
         products = edge_model(pixels, values, shape).products(edges.shape[1])
         information, gradient = products[:, 1 + free[:, None], 1 + free], products[:, 1 + free, :1]
         step = np.linalg.solve(information + _TINY * np.eye(len(free)), gradient)
@@ -194,30 +193,26 @@ def _profiles(
     inside = raw.edges.centre + (share * side * raw.edges.light)[:, None] * across
     gap = np.abs(((at.at(inside) - lines.middle) * lines.normal).sum(axis=1))
     near = share < 0.5
-    room = np.minimum(np.where(near, _ROOM * gap, np.inf), 0.4 * lines.width)
-    d = np.linspace(-1, 1, _PLACES) * room[:, None]
+    half = np.minimum(np.where(near, _ROOM * gap, np.inf), 0.4 * lines.width)
+    d = np.linspace(-1, 1, _PLACES) * half[:, None]
     image = np.asarray(raw.image, dtype=np.float32)
     seen = np.zeros(d.shape)
     for part in _ALONG:
         middle = lines.middle + (part * lines.length)[:, None] * lines.tangent
         seen += interpolate(image, middle[:, None] + d[..., None] * lines.normal[:, None]) / len(_ALONG)
-    total, square = seen.sum(axis=1), (seen**2).sum(axis=1)
-    costs, values = (
-        np.empty((len(sigmas), len(offsets), len(d))),
-        np.empty((len(sigmas), len(offsets), len(d), 2)),
-    )
-    for (k, sigma), (j, offset) in product(enumerate(sigmas.tolist()), enumerate(offsets.tolist())):
-        beyond = (side[:, None] * (d - offset) - gap[:, None]) / sigma
-        x = erf_and_density((d - offset) / sigma)[0]
-        x -= (side * near)[:, None] * (1 + erf_and_density(beyond)[0])
+    level = seen.mean(axis=1)
+    moved, profile = (x.astype(np.float32) for x in (d - offsets[:, None, None], seen - level[:, None]))
+    sign, room = (x.astype(np.float32)[:, None] for x in (side, gap))
+    tried = []
+    for sigma in sigmas.tolist():
+        x = erf_and_density(moved / sigma)[0]
+        x -= sign * near[:, None] * (1 + erf_and_density((sign * moved - room) / sigma)[0])
         # The line through the profile over x.
-        sum_x, product_x = x.sum(axis=1), (x * seen).sum(axis=1)
-        contrast = _PLACES * product_x - sum_x * total
-        contrast /= np.maximum(_PLACES * (x**2).sum(axis=1) - sum_x**2, _TINY)
-        mean = (total - contrast * sum_x) / _PLACES
-        cost = square - mean * total - contrast * product_x
-        costs[k, j] = np.where(contrast > 0, cost, np.inf)
-        values[k, j] = np.stack([mean, contrast], axis=-1)
+        sum_x, product_x, squares = (one.sum(axis=2, dtype=float) for one in (x, x * profile, x * x))
+        contrast = _PLACES * product_x / np.maximum(_PLACES * squares - sum_x**2, _TINY)
+        cost = np.where(contrast > 0, -contrast * product_x, np.inf)
+        tried.append((cost, level - contrast * sum_x / _PLACES, contrast))
+    costs, means, contrasts = (np.stack(one) for one in zip(*tried, strict=True))
     every = np.arange(len(d))
     k, j = np.divmod(costs.reshape(-1, len(d)).argmin(axis=0), len(offsets))
     # The least of the parabola through the costs of three offsets.
@@ -227,7 +222,7 @@ def _profiles(
     bend = before - 2 * here + after
     part = 0.5 * np.divide(before - after, bend, out=np.zeros(len(d)), where=bend > 0)
     found = offsets[j] + part * (offsets[1] - offsets[0])
-    return np.column_stack([values[k, j, every], sigmas[k]]), found
+    return np.column_stack([means[k, j, every], contrasts[k, j, every], sigmas[k]]), found
 
 
 def _plain_profile(

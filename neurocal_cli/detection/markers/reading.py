@@ -203,7 +203,7 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
         which, light = _cells(grey, H, bits, border)
         for dictionary in USUAL if len(which) >= _FEWEST else ():
             if DICTIONARIES[dictionary] == bits:
-                marks = _marks(corners[which], light, dictionary)
+                marks = _marks(grey, corners[which], light, dictionary)
                 if len(marks) >= _FEWEST:
                     yield marks, border
 
@@ -214,11 +214,16 @@ def markers_in(
     """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
     H, corners = _framed(grey, corners)
     which, light = _cells(grey, H, DICTIONARIES[dictionary], border, _ROUGHLY_WRONG)
-    return _marks(corners[which], light, dictionary, first, count)
+    return _marks(grey, corners[which], light, dictionary, first, count)
 
 
 def _marks(
-    corners: Array, light: NDArray[np.bool_], dictionary: str, first: int = 0, count: int | None = None
+    grey: NDArray[np.uint8],
+    corners: Array,
+    light: NDArray[np.bool_],
+    dictionary: str,
+    first: int = 0,
+    count: int | None = None,
 ) -> Marks:
     """The markers within quadrangles (N, 4, 2), by their light cells.
 
@@ -232,7 +237,47 @@ def _marks(
     number, one = np.unique(number[k], return_index=True)
     # The marker's first corner is that of the quadrangle to which the bits were turned.
     order = (np.arange(4) + turn[k[one], None]) % 4
-    return Marks(number, np.take_along_axis(corners[k[one]], order[..., None], axis=1), dictionary)
+    corners = _on_edges(grey, np.take_along_axis(corners[k[one]], order[..., None], axis=1))
+    return Marks(number, corners, dictionary)
+
+
+# Sides by their first corner: twice four places along each, and depths outwards, in sides of the marker.
+_FIRST = (0.15, 0.25, 0.35, 0.45)
+_OUTWARDS = np.linspace(-0.12, 0.2, 33)
+_WITHIN_BORDER = 25  # depths, among which the dark border is
+_ALONG_SIDES = np.roll(_UNIT, -1, axis=0) - _UNIT
+_NORMALS = -np.roll(_ALONG_SIDES, -1, axis=0)
+_MIDDLES = _UNIT[:, None] + np.array([[0.3], [0.7]]) * _ALONG_SIDES[:, None]
+_ACROSS_SIDES = (
+    _UNIT[:, None, None]
+    + np.array([*_FIRST, *(1 - np.array(_FIRST))])[:, None, None] * _ALONG_SIDES[:, None, None]
+    + _OUTWARDS[:, None] * _NORMALS[:, None, None]
+).reshape(-1, 2)
+
+
+def _on_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
+    """Quadrangles (N, 4, 2) with their sides moved to where the dark borders of markers within them end.
+
+    Where squares touch the corners of tags, only the inner outlines of blurred borders may be found.
+    """
+    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    level = _sampled(grey, H, _ACROSS_SIDES).reshape(len(H), 8, len(_FIRST), len(_OUTWARDS)).mean(axis=2)
+    dark = level[..., :_WITHIN_BORDER].argmin(axis=2)[..., None]
+    low = np.take_along_axis(level, dark, axis=2)
+    beyond = np.where(np.arange(len(_OUTWARDS)) > dark, level, low)
+    half = 0.5 * (low + beyond.max(axis=2, keepdims=True))
+    after = np.maximum((beyond > half).argmax(axis=2)[..., None], 1)
+    ahead, behind = (np.take_along_axis(level, after - step, axis=2) for step in (0, 1))
+    step = _OUTWARDS[1] - _OUTWARDS[0]
+    depth = _OUTWARDS[after] - step * np.clip((ahead - half) / np.maximum(ahead - behind, 1e-9), 0, 1)
+    at = homography_at(H, _MIDDLES.reshape(-1, 2) + depth * np.repeat(_NORMALS, 2, axis=0))
+    points = np.concatenate([at, np.ones_like(at[..., :1])], axis=2).reshape(len(H), 4, 2, 3)
+    sides = np.cross(points[:, :, 0], points[:, :, 1])
+    met = np.cross(np.roll(sides, 1, axis=1), sides)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        met = met[..., :2] / met[..., 2:]
+    seen = (half - low > 0.5 * _CONTRAST).all(axis=(1, 2)) & np.isfinite(met).all(axis=(1, 2))
+    return np.where(seen[:, None, None], met, corners)
 
 
 def numbers_in(
