@@ -284,9 +284,10 @@ def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) ->
     # Coordinates are kept in rows, because sums over many short rows are slower.
     given = start.T
     low, high = half, np.array([[width - 1 - half], [height - 1 - half]])
-    padded = (given >= low) & (given <= high)
-    good = padded[0] & padded[1]
-    centre = np.rint(np.where(good, given, low))
+    inside = np.clip(given, low, high)
+    near = np.abs(given - inside) < 1
+    good = near[0] & near[1]
+    centre = np.rint(np.where(good, inside, low))
     step, saddle = _newton(image, centre, sigma)
     # Derivatives are taken at the nearest pixel, so only points that moved to another pixel continue.
     for _ in range(rounds - 1):

@@ -1,9 +1,9 @@
 """Find a board with markers from images of it: its kind, its numbers of columns and rows, and its markers.
 
 The proportions are the side of a marker over that of a square, or the spacing of tags. A first value comes
-from the corners of the markers, which are off by up to a pixel. With it the vertices are found, and these are
-good to a twentieth. The spacing of tags is the one with which most squares of two by two tags are seen in
-perspective. The side of a marker is told by the light across its border, between known vertices.
+from the corners of the markers, and with it the vertices are found, which are good to a twentieth of a pixel.
+The spacing of tags is the one with which most squares of two by two tags are seen in perspective. The side of
+a marker is told by the light across its border, between known vertices.
 """
 
 from __future__ import annotations

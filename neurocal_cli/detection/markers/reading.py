@@ -243,8 +243,8 @@ def _marks(
 
 # Sides by their first corner: twice four places along each, and depths outwards, in sides of the marker.
 _FIRST = (0.15, 0.25, 0.35, 0.45)
-_OUTWARDS = np.linspace(-0.12, 0.2, 33)
-_WITHIN_BORDER = 25  # depths, among which the dark border is
+_OUTWARDS = np.linspace(-0.12, 0.2, 65)
+_WITHIN_BORDER = 49  # depths, among which the dark border is
 _ALONG_SIDES = np.roll(_UNIT, -1, axis=0) - _UNIT
 _NORMALS = -np.roll(_ALONG_SIDES, -1, axis=0)
 _MIDDLES = _UNIT[:, None] + np.array([[0.3], [0.7]]) * _ALONG_SIDES[:, None]
