@@ -232,8 +232,9 @@ def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges 
         of.observations(x.lines, x.fit.values[:, OFFSET], x.offset_variance, x.shifts.terms(x.lines))
         for of, x in ((grid_image, fitted), (rim, fit))
     )
-    lens = fitted.map.map.lens_models[fitted.map.map.radial :]
-    mapped = select_map(fitted.map.map, between.joined_with(to_rim), fitted.map.shift, models=lens)
+    start = fitted.map.map
+    lens = start.lens_models[start.radial :] or ((start.radial, 0),)  # a wide lens may be of a simpler kind
+    mapped = select_map(start, between.joined_with(to_rim), fitted.map.shift, models=lens)
     if mapped.excess > _AGREES:
         return None
     variance = fit.fit.covariance[:, OFFSET, OFFSET] * fit.fit.variance_growth + fitted.unevenness

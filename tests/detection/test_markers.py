@@ -600,19 +600,33 @@ def test_all_vertices_of_photographs_are_found(real_files: RealFiles) -> None:
         assert sum(len(one.ids) for one in found) >= least
 
 
+def before_fisheye(flat: Scene, nearer: float = 1.0) -> Scene:
+    """A scene before a fisheye of 180 degrees."""
+    focal, old = flat.size[0] / np.pi, flat.camera.intrinsics
+    lens = Camera(
+        Intrinsics(focal, 1.003 * focal, old.u0, old.v0), Distortion("fisheye", (0.0,) * 4), flat.size
+    )
+    near = replace(flat.pose, t=flat.pose.t * [1.0, 1.0, nearer * focal / old.alpha_u])
+    return replace(flat, camera=lens, pose=near)
+
+
 @pytest.mark.parametrize("seed", slow_but((9702,), (9702, 9707)))
 def test_tags_that_are_not_read_before_a_fisheye_are_found_from_the_others(seed: int) -> None:
     """In the second, a saddle point far from all others is none of the board's."""
     flat = marked_scene(plane_of("aprilgrid:6x4:40:0.3"), seed, 67.6, (960, 720))
-    focal, old = 960 / np.pi, flat.camera.intrinsics
-    lens = Camera(
-        Intrinsics(focal, 1.003 * focal, old.u0, old.v0), Distortion("fisheye", (0.0,) * 4), (960, 720)
-    )
-    near = replace(flat.pose, t=flat.pose.t * [1.0, 1.0, focal / old.alpha_u])
-    picture = taken(replace(flat, camera=lens, pose=near), seed, 2 if seed == 9702 else 3)
+    picture = taken(before_fisheye(flat), seed, 2 if seed == 9702 else 3)
     error, _ = errors_of(detect_points(picture.image, flat.board, "vertices"), picture)
     assert len(error) == 96  # 74 and 82
     assert np.abs(error).max() < 0.05
+
+
+def test_mid_points_before_a_fisheye_with_few_parameters_are_measured() -> None:
+    """The edges to the rim are compared with the lens that was found, which is none of the richer ones."""
+    flat = marked_scene(plane_of("charuco:5x8:40:30:DICT_4X4_250"), 11, 22.0, psf=1.2)
+    picture = taken(before_fisheye(flat, 0.7), 11, 2)
+    error, _ = errors_of(detect_points(picture.image, flat.board), picture)
+    assert len(error) >= 40
+    assert np.sqrt((error**2).mean()) < 0.1
 
 
 def test_a_stray_far_beside_a_fisheyes_board_hides_no_other_stray() -> None:
