@@ -213,14 +213,15 @@ def is_common(found: Named, still: RigFit, fit: RigFit, n: int) -> bool:
     """Whether a cause is more probable than n views that contradict the others, each for reasons of its own.
 
     `fit` is without these views, and `still` has all at its cameras and rig (`at_fit`). The evidence of a
-    second geometry is that of the fits of both parts.
+    second geometry is that of the fits of both parts; other cameras saw the frames of the smaller one, too.
     """
     squares, degrees = scatter(still)
     rest, evidence = scatter(fit)[0], found.found.evidence
     if found.cause in TWO_GEOMETRIES:
-        own = scatter(_by_itself(still.problem, fit, found))[0]
+        own, others = _by_itself(still.problem, fit, found), at_fit(_part(still.problem, found, True), fit)
+        after = rest + max(scatter(own)[0] - scatter(others)[0], 0.0)
         choices = float(np.log(still.problem.together.sum() * len(still.problem.cameras)))
-        evidence = _evidence(squares, rest + own, degrees, int(of_rig(still).sum())) - choices
+        evidence = _evidence(squares, after, degrees, int(_moving(own, found).sum())) - choices
     return evidence > _evidence(squares, rest, degrees, 6 * n)
 
 
@@ -244,14 +245,26 @@ def of_rig(fit: RigFit) -> NDArray[np.bool_]:
     return free
 
 
-def _by_itself(problem: RigProblem, fit: RigFit, found: Named) -> RigFit:
-    """The frames of the smaller part with a rig of their own and the cameras of the other part's fit."""
+def _moving(fit: RigFit, found: Named) -> NDArray[np.bool_]:
+    """(n_shared,) which unknowns a change moves: the pose of its camera, all others' if that is the first."""
+    of_one = np.zeros(len(fit.free), dtype=bool)
+    of_one[fit.state.columns.rigs[max(found.side, 0)]] = True
+    return of_one if of_one.any() else of_rig(fit)
+
+
+def _part(problem: RigProblem, found: Named, of_others: bool = False) -> RigProblem:
+    """The problem in which only frames of the smaller part determine the rig; of its views, or the others."""
     inside = np.zeros(len(problem.scale), dtype=bool)
     for views, observed in zip(found.apart, problem.observations, strict=True):
         inside[observed.view[views]] = True
-    part = problem.detached([~inside[observed.view] for observed in problem.observations])
-    start = at_fit(part, fit)
-    return adjust_rig(part, start.state, of_rig(start))
+    pairs = zip(found.apart, problem.observations, strict=True)
+    return problem.detached([~inside[observed.view] | (views & of_others) for views, observed in pairs])
+
+
+def _by_itself(problem: RigProblem, fit: RigFit, found: Named) -> RigFit:
+    """The frames of the smaller part with a rig of their own and the cameras of the other part's fit."""
+    start = at_fit(_part(problem, found), fit)
+    return adjust_rig(start.problem, start.state, _moving(start, found))
 
 
 def _moved_or_larger(problem: RigProblem, fit: RigFit, found: Named) -> Named:

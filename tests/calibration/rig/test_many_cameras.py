@@ -248,6 +248,33 @@ def test_a_camera_that_moved_is_named_and_its_larger_part_kept(at: int) -> None:
     assert any("camera cam2 moved between" in why for why in rig.verdict.reasons)
 
 
+def test_a_camera_that_moved_is_named_beside_many_that_did_not() -> None:
+    # The others saw the frames after it as well; each view might contradict the rig for its own reason.
+    rng = np.random.default_rng(1)
+    rig = random_rig("line", 8, 16, rng)
+    points, then = rig.points(0.1, rng), moved(rig, "cam3", 2.0, 0.0).points(0.1, rng)["cam3"]
+    points["cam3"] = joined(of_frames(points["cam3"], lambda k: k < 10), of_frames(then, lambda k: k >= 10))
+    found = calibrate_rig(points, skew=False, target="given", distortion="k1k2")
+    assert found.verdict is not None
+    assert found.verdict.word == "poor"
+    assert "camera cam3 moved between 009 and 010" in found.verdict.reasons[0]
+    assert set(found.views_left_out) == {("cam3", f"{k:03d}") for k in range(10, 16)}
+
+
+def test_views_that_are_each_wrong_by_themselves_are_no_camera_that_moved() -> None:
+    rng = np.random.default_rng(1)
+    rig = random_rig("line", 8, 16, rng)
+    points = rig.points(0.1, rng)
+    for k in range(11, 16):
+        then = moved(rig, "cam3", rng.uniform(1.0, 3.0), rng.uniform(-50.0, 50.0)).points(0.1, rng)["cam3"]
+        rest = of_frames(points["cam3"], lambda frame, k=k: frame != k)
+        points["cam3"] = joined(rest, of_frames(then, lambda frame, k=k: frame == k))
+    found = calibrate_rig(points, skew=False, target="given", distortion="k1k2")
+    assert {camera for camera, _ in found.views_left_out} == {"cam3"}
+    assert found.verdict is not None
+    assert not any("moved" in why for why in found.verdict.reasons)
+
+
 def test_a_camera_that_is_late_is_found_and_compensated() -> None:
     rng = np.random.default_rng(0)
     rig = random_rig("line", 4, 7, rng)
