@@ -191,14 +191,27 @@ def examined(problem: RigProblem, frames: FrameNames) -> list[Edge]:
 
 
 def _chosen(seen: NDArray[np.bool_]) -> list[Pair]:
-    """Pairs of cameras: those that connect all, and of each camera those with most frames in common."""
+    """Pairs of cameras: those that connect all, and of each camera those with most frames in common.
+
+    They connect the views of each frame, too: one that is compared with no other could be wrong unnoticed.
+    """
     common = seen.astype(int) @ seen.T.astype(int)
     np.fill_diagonal(common, 0)
-    wanted = {(min(pair), max(pair)) for pair in _tree(common) if common[pair]}
+    chosen = np.zeros(common.shape, dtype=bool)
+    for pair in _tree(common):
+        chosen[pair] = common[pair] > 0
     for a, row in enumerate(common):
         best = np.argsort(-row, kind="stable")[:_PARTNERS]
-        wanted |= {(min(a, int(b)), max(a, int(b))) for b in best if row[b]}
-    return sorted(wanted, key=lambda pair: (-common[pair], pair))
+        chosen[a, best] |= row[best] > 0
+    chosen |= chosen.T
+    for frame in np.unique(seen, axis=1).T:
+        cameras = np.flatnonzero(frame)
+        while len(parts := groups(chosen[np.ix_(cameras, cameras)])) > 1:
+            one, others = cameras[parts[0]], cameras[np.concatenate(parts[1:])]
+            i, k = np.unravel_index(np.argmax(common[np.ix_(one, others)]), (len(one), len(others)))
+            chosen[one[i], others[k]] = chosen[others[k], one[i]] = True
+    pairs = [(int(a), int(b)) for a, b in np.argwhere(np.triu(chosen))]
+    return sorted(pairs, key=lambda pair: (-common[pair], pair))
 
 
 def _tree(weight: NDArray[np.int_]) -> list[Pair]:

@@ -261,6 +261,24 @@ def test_a_camera_that_moved_is_named_beside_many_that_did_not() -> None:
     assert set(found.views_left_out) == {("cam3", f"{k:03d}") for k in range(10, 16)}
 
 
+def test_a_wrong_view_is_found_whose_camera_was_compared_with_others_only() -> None:
+    # It took its place as that of the frame, and the adjustment led all cameras astray.
+    rng = np.random.default_rng(3)
+    rig = random_rig("line", 8, 16, rng)
+    points = rig.points(0.1, rng)
+    # Frame 005 is that of cameras which have more frames in common with others than with each other.
+    seen = {"cam0": {*range(3, 16)}, "cam6": {*range(10)}, "cam7": {*range(10)}}
+    for name in rig.cameras:
+        own = seen.get(name, {*range(16)} - {5})
+        points[name] = of_frames(points[name], own.__contains__)
+    moment_later = of_frames(points["cam0"], lambda k: k == 6)
+    late = replace(moment_later, view=np.full(len(moment_later.world), "005"))
+    points["cam0"] = joined(of_frames(points["cam0"], lambda k: k != 5), late)
+    found = calibrate_rig(points, skew=False, target="given", distortion="k1k2")
+    assert set(found.views_left_out) == {("cam0", "005")}
+    assert found.rmse_px < 0.15
+
+
 def test_views_that_are_each_wrong_by_themselves_are_no_camera_that_moved() -> None:
     rng = np.random.default_rng(1)
     rig = random_rig("line", 8, 16, rng)
