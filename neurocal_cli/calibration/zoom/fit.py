@@ -170,7 +170,7 @@ def _without_odd(
     """
     rest, odd = start, list[tuple[CalibratedSettings, int]]()
     while len(odd) < _TOGETHER and start.may_reject(len(odd)):
-        suspect = most_suspect(*left_out_errors(rest, joints[0]))
+        suspect = most_suspect(left_out_errors(rest, joints[0]))
         if suspect is None:
             return None
         odd.append((rest, suspect))

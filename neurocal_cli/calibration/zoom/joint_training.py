@@ -266,7 +266,7 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     there = start.data.linearise(local, constants)
     rmse = np.sqrt(there.normal.cost / start.data.counts)
     # The linearisation fails for a member now and then, so the median counts.
-    squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
+    squares = np.median([left_out_errors(start, joint) ** 2 for joint in joints], axis=0)
     counts = np.where(is_inside(x), start.data.counts, 0)
     left_out = float(np.sqrt((squares * counts).sum() / counts.sum()))
     free_pose = float(np.sqrt(2 * free_pose_variance(start)))
@@ -307,30 +307,20 @@ def _warnings(lens: ZoomLens, start: CalibratedSettings) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Array]:
-    """Errors at settings (S,), each predicted from all others.
-
-    The first are rms reprojection errors [px]. The second are squared errors of the local parameters over
-    their expectation, a mean over them; about 1.
-    """
+def left_out_errors(start: CalibratedSettings, joint: Joint) -> Array:
+    """Rms reprojection errors [px] at settings (S,), each predicted from all others."""
     tables, variance = start.tables, start.variance
     scatter = joint.nets.local_scatter(tables.local)
     local, J = joint.nets.local_with_jacobian(start.controls)
     _, L, P = J.shape
     normal = tables.normal
-    H = normal.S[:, :L, :L]
     spread = J @ joint.covariance[:P, :P] @ np.swapaxes(J, 1, 2)
     # The constants of the networks differ from those of the tables; the effect is small.
     error = local - tables.local
     K = spread @ with_scatter(normal, scatter, variance).S[:, :L, :L] / variance
-    remain = np.eye(L) - K
-    out = np.asarray(np.linalg.solve(remain, error[..., None]), dtype=np.float64)
-    spread_out = np.linalg.solve(remain, spread)
-    own = variance * inverse(H) + np.diag(scatter)
-    expected = np.asarray(spread_out + own)
-    normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
+    out = np.linalg.solve(np.eye(L) - K, error[..., None])
     squares = normal.at(np.pad(out[..., 0], ((0, 0), (0, normal.S.shape[1] - L))))
-    return np.sqrt(np.maximum(squares, 0.0) / start.data.counts), np.maximum(normalised, 0.0)
+    return np.sqrt(np.maximum(squares, 0.0) / start.data.counts)
 
 
 def is_inside(x: Array) -> NDArray[np.bool_]:
@@ -343,9 +333,9 @@ def is_inside(x: Array) -> NDArray[np.bool_]:
     return inside if inside.any() else ~inside
 
 
-def most_suspect(pixels: Array, normalised: Array) -> int | None:
+def most_suspect(pixels: Array) -> int | None:
     """The setting that the others predict worst, if far worse than the rest; of (S,) `left_out_errors`."""
-    worst = int((normalised * pixels).argmax())
+    worst = int(pixels.argmax())
     return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
 
 

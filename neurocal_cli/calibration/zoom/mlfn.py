@@ -14,7 +14,8 @@ functions (A x + B) / (1 + C x) of the positions of groups of glass and of the o
 steeply towards a pole beyond the end of the range, at close focus or at the long end of a zoom. Tanh units
 would need many settings there. Plane and rational unit together are all such functions, with the pole at
 -1 / tilt, and all parabolas (tilt 0). The rational unit is 0 at both ends of the range. Beyond them x in its
-denominator stays -1 or 1, so that extrapolation does not reach the pole.
+denominator stays -1 or 1, so that extrapolation does not reach the pole. What optics gives no pole, the image
+centre, has parabolas alone: through four values of a control a hyperbola passes for any wave.
 
 B networks of one topology are computed together: weights are (B, P).
 
@@ -46,6 +47,7 @@ _LARGEST_TILT = 0.99
 # test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
 _FLAT = 1e-4  # of free weights: a standard deviation of 100
 _MOST = 1e4
+_HELD = 1e12  # of weights that stay 0
 _LEAST, _LEAST_FEW, _LEAST_SPARSE, _LEAST_TILT = 0.03, 0.3, 1.0, 1.0
 _ENOUGH_VALUES = 4
 # The descent has no criterion to stop: the priors are updated until the schedule ends.
@@ -209,13 +211,16 @@ def train(
     variance: Array,
     weights: Array,
     schedule: Schedule | None = None,
+    poles: NDArray[np.bool_] | None = None,
 ) -> TrainedNets:
     """Train a stack of networks, all at once, from initial weights (B, P).
 
     The controls x (n, D) are scaled to about [-1, 1], the targets (n,) or (B, n) centred and scaled to a
     spread of about 1. Their variances, likewise, are 0 where unknown, so that the scatter is the noise.
+    `poles` (B,) tells which networks may have one, by default all.
     """
-    learner = _NetworkStack(topology, x, targets, variance, weights)
+    without = np.zeros(len(weights), dtype=bool) if poles is None else ~poles
+    learner = _NetworkStack(topology, x, targets, variance, weights, without)
     schedule = schedule or Schedule()
     descent = LevenbergMarquardt(learner, _OPTIONS, floor=-1.0)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -230,13 +235,23 @@ def train(
 class _NetworkStack:
     """Networks in training as a problem of `LevenbergMarquardt`: each network is a group of cost 2 E."""
 
-    def __init__(self, topology: Topology, x: Array, targets: Array, variance: Array, weights: Array) -> None:
+    def __init__(
+        self,
+        topology: Topology,
+        x: Array,
+        targets: Array,
+        variance: Array,
+        weights: Array,
+        without_pole: NDArray[np.bool_],
+    ) -> None:
         self.topology, self.x, self.targets, self.variance = topology, x, targets, variance
-        self.w, self.diagonal = weights, range(topology.n_weights)
+        self.w, self.diagonal = weights.copy(), range(topology.n_weights)
         self.a = np.full((len(weights), topology.n_groups), 0.3)
+        self.w[without_pole, topology.parts["a"]] = 0.0
+        self.a[without_pole, 6 + topology.controls] = _HELD
         # For targets without a variance, a thousandth of their spread until the noise is estimated.
         self.tau2 = np.full(len(weights), 0.0 if variance.any() else 1e-6)
-        self.y, self.J = respond_with_jacobian(topology, weights, x)
+        self.y, self.J = respond_with_jacobian(topology, self.w, x)
         self._weigh()
 
     def _weigh(self) -> None:
@@ -321,6 +336,7 @@ def updated_precision(
     it overshoots between them. It is at most 1 for weights from a control of three values, where a unit could
     turn between two of them without any effect on the data, and for the weights a of the rational units, as
     tanh(a) saturates. It is exactly 1 for a where a control has three values, as these leave the tilt open.
+    Weights that are held at 0 stay so.
     """
     kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
     least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
@@ -332,7 +348,8 @@ def updated_precision(
         most[6 + D] = _LEAST_TILT
     effective = np.maximum(kinds.sum(axis=1) - precision * (leverage @ kinds.T), 1e-3)
     squares = np.maximum((weights * weights) @ kinds.T, 1e-12)
-    return np.sqrt(precision * np.clip(effective / squares, least, most))
+    updated = np.sqrt(precision * np.clip(effective / squares, least, most))
+    return np.where(precision == _HELD, _HELD, updated)
 
 
 def prior_precision(topology: Topology, precision: Array) -> Array:

@@ -72,6 +72,7 @@ _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING, _WITH_PRODUCTS = 2.0, 1.5  # most of them, and most if tanh units have products
 # Log-odds that tanh units of alpha_u's networks must reach, and another scale of it than the logarithmic one.
 _LOG_ODDS = 5.0
+_CENTRE = (2, 3)  # u0 and v0, which are where the glass wanders
 _AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
 _GRID = 13  # values of each control at which networks are compared
 
@@ -259,7 +260,7 @@ def fit_committee(
         values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
         values, spread = _given(local, values, H, variance, held)
     plain = [2, 3, *range(4 + alone, L)]
-    targets = [_Targets(values[:, j], spread[:, j]) for j in plain]
+    targets = [_Targets(values[:, j], spread[:, j], pole=j not in _CENTRE) for j in plain]
     for scale in SCALES:
         of_alpha, derivative = to_scale(scale, values[:, 0])
         targets.append(_Targets(of_alpha, spread[:, 0] * derivative**2, derivative))
@@ -298,6 +299,7 @@ class _Targets:
     variance: Array  # (S,)
     # (S,) of a focal length on one of `SCALES`: derivatives by the length itself.
     derivative: Array | None = None
+    pole: bool = True  # whether it may rise towards one, as optics does
 
     @cached_property
     def scaling(self) -> tuple[float, float]:
@@ -332,7 +334,8 @@ def _fit(
         report(k / len(topologies))
         stack = np.concatenate([of_target[k] for of_target in starts])
         of = np.repeat(np.arange(len(targets)), len(stack) // len(targets))
-        trained = train(topology, x, scaled[of], variance[of], stack, budget.schedule)
+        poles = np.array([one.pole for one in targets])[of]
+        trained = train(topology, x, scaled[of], variance[of], stack, budget.schedule, poles)
         for t, w, a, tau2, e in zip(
             of, trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
         ):

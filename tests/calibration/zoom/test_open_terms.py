@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.zoom_laws import between, boards, grid, over_std
+from support.zoom_laws import between, boards, grid, over_std, seen
 
 from neurocal import fit_lens
 from neurocal_cli.adjustment.cross_validation import Quadratics
@@ -92,3 +92,12 @@ def test_the_std_of_lenses_that_bend_by_little_hold(law: str, views: int) -> Non
     rms = np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
     assert (rms > 0.6).all()
     assert (rms < 1.2).all()
+
+
+@pytest.mark.slow
+def test_the_std_contain_the_laws_that_four_zooms_leave_open() -> None:
+    """A hyperbola would pass for the cosine of the centre."""
+    for seed in range(90000, 90004):
+        lens = fit_lens(seen("a", grid(4, 4), seed), distortion="none")
+        assert lens.verdict.word == "good"
+        assert np.abs(over_std(lens, "a", between(4, 4))[:, :4]).max() < 3.0
