@@ -71,7 +71,7 @@ class Contest:
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
     n: float  # effective number of equations beyond the unknowns
     std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
-    worth: float = 1.0  # effective number of residuals over their number, that the reported std count
+    counted_by_std: float = 1.0  # share of the residuals that the reported std count as independent
 
     @property
     def of_all_views(self) -> bool:
@@ -87,12 +87,12 @@ class Contest:
             steps += _steps(self.lin, one)
         return self.lin.residuals(steps)
 
-    def instead_of_target(self, worth: float = 1.0) -> float:
+    def instead_of_target(self, counted: float = 1.0) -> float:
         """Log odds of causes other than the target's shape, known or not; 0 if there are none.
 
         A cause that cannot be told from the target's shape says nothing against it. The level by which the
         others have to beat that shape is taken off; a given value, which the shape takes in, comes first if
-        it is hardly less probable. An equation is `worth` so much for that shape.
+        it is hardly less probable. That shape has `counted` of each equation.
         """
         first = self.causes[0] if self.causes else None
         if first is None:
@@ -101,16 +101,16 @@ class Contest:
         if not (own.of_board or own.of_given) and any(x.rival.of_board for x in self.close[0]):
             return 0.0
         if first.rival.effect in OF_POSES:  # the target takes in what is wrong with given poses
-            return _FAR_MORE * worth * self.evidence
+            return _FAR_MORE * counted * self.evidence
         # A lens whose rays do not meet in one point says nothing against a shape that comes before it.
         beside = (no_pupil,) if first.rival.of_board else ()
         known = [one for one in self.causes if not (one.rival.unknown or one.rival.effect in beside)]
         others = [one.evidence for one in known if not one.rival.of_board]
         told = sum(one.evidence for one in self.causes)
         if max(others, default=0.0) > _MUCH * told or first.rival.unknown or first.pattern == "one":
-            return worth * self.evidence + (LEVEL if first.rival.of_given else -LEVEL)
+            return counted * self.evidence + (LEVEL if first.rival.of_given else -LEVEL)
         # A shape that is far more probable than the found one is not open: no print is stretched by percents.
-        return worth * told / _FAR_MORE if first.pattern == "all" else 0.0
+        return counted * told / _FAR_MORE if first.pattern == "all" else 0.0
 
 
 def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False) -> Contest | None:
@@ -196,7 +196,7 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
             before = Known.at(at, at.spare).right[: len(before)]
         ranking = estimates(at, at.spare * share, _others(causes, rivals))
     # As an estimated target counts it: all residuals as independent.
-    evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
+    evidence -= 0.5 * lin.spare * (worth - share) * float(np.log(left))
     return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence, n)
 
 
@@ -392,7 +392,7 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0
     )
     # Residuals that are alike because of a cause are no noise that neighbours share.
-    by_bias = BIASED.grade(max(biased, default=0.0) / contest.worth**0.5)
+    by_bias = BIASED.grade(max(biased, default=0.0) / contest.counted_by_std**0.5)
     return max(grade, min(by_bias, 1) if found.rival.of_distance else by_bias), reason
 
 

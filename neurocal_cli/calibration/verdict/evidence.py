@@ -283,7 +283,7 @@ class Evidence:
         if held is None:
             return None
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
-        return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)), worth=self.worth)
+        return replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)), counted_by_std=self.worth)
 
     @property
     @quietly
