@@ -193,25 +193,23 @@ def with_target(
     if options.distortion == "plumb-line" or rich:
         return solution, rejected
     known = _searched(problem, solution, rejected, options, choice)
-    if not _may_contradict_only_given(problem, *known):
+    if not _may_contradict_only_given(problem, known[1]):
         return known
     try:
         found = _searched(problem, solution.of_all or fit(problem, options), known[1], options, choice)
     except DegenerateGeometryError:
         return known
-    explained = found[0].target is not None and not found[1].views and len(found[1]) <= len(known[1])
+    explained = found[0].target is not None and len(found[1]) <= len(known[1])
     return found if explained and rms(found[0]) <= NO_WORSE * rms(known[0]) else known
 
 
-def _may_contradict_only_given(problem: Problem, solution: Solution, rejected: Rejected) -> bool:
-    """Whether the rejected views or points may contradict only the given target, so all are tried again."""
-    target, views = solution.target, rejected.views
-    if views:
-        unexplained = target is None or target.bends is not None
-        return unexplained and all("bent" in why for why in views.values())
+def _may_contradict_only_given(problem: Problem, rejected: Rejected) -> bool:
+    """Whether the rejected points may contradict only the given target, so all are tried again.
+
+    A plane may stand elsewhere in the only view; in other views its points would have come back.
+    """
     if not len(rejected) or problem.views.n_views > 1:
         return False
-    # A plane that stands elsewhere in the only view; in other views its points would have come back.
     given, _, ids = distinct_points([problem.points])
     return bool(planes_of(given, ids).any())
 
@@ -220,7 +218,7 @@ def _searched(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
     """Alternate between target and camera as `with_target` does, from the views of one solution."""
-    if not _can_tell(solution, None):
+    if not _can_tell(solution):
         return solution, rejected
     kept = solution.noted(target_kept=choice == "auto")
     if choice == "auto" and not _tell_independently(solution):
@@ -253,9 +251,6 @@ def _settled(
         if again is None:
             break
         fitted, outliers = again
-        same_views = fitted.problem.views.names == solution.problem.views.names
-        if not (same_views or _can_tell(fitted, found.target)):
-            break
         if not _is_where_it_was(found, fitted):
             refound = _found(fitted, choice, found.target)
             if refound is None:
@@ -269,11 +264,9 @@ def _settled(
     return None if best is None else (best, rejected)
 
 
-def _can_tell(solution: Solution, known: Target | None) -> bool:
+def _can_tell(solution: Solution) -> bool:
     """Whether there are enough independent views to estimate the target."""
-    problem = solution.problem
-    points = problem.points if known is None else known.straightened(problem.points)
-    return views_suffice([points], known, solution.repeated.n_groups)
+    return views_suffice([solution.problem.points], None, solution.repeated.n_groups)
 
 
 def _tell_independently(solution: Solution) -> bool:
