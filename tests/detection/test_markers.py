@@ -521,9 +521,24 @@ def test_tags_without_squares_have_the_mid_points_of_their_edges(
         detect_points(picture.image, Board((replace(plane, border=1),)))
 
 
-@pytest.mark.parametrize("condition", slow_but(({},), ({}, {"psf": 1.6}, {"tilt": 60.0}, {"noise": 8.0})))
-def test_markers_that_stand_alone_have_the_mid_points_of_their_edges(condition: dict[str, float]) -> None:
-    scene = marked_scene(plane_of("arucogrid:3x2:40:0.25:DICT_4X4_50"), 6, square=56, **condition)
+@pytest.mark.parametrize(
+    ("condition", "spacing"),
+    [
+        ({}, 0.25),
+        # The codes are nearer to the edges than the next markers are.
+        ({"square": 34}, 1.0),
+        *(
+            pytest.param(condition, spacing, marks=pytest.mark.slow)
+            for condition in ({"psf": 1.6}, {"tilt": 60.0}, {"noise": 8.0})
+            for spacing in (0.25, 0.6)
+        ),
+    ],
+)
+def test_markers_that_stand_alone_have_the_mid_points_of_their_edges(
+    condition: dict[str, float], spacing: float
+) -> None:
+    plane = plane_of(f"arucogrid:3x2:40:{spacing}:DICT_4X4_50")
+    scene = marked_scene(plane, 6, **{"square": 56 if spacing < 0.5 else 42, **condition})
     picture = taken(scene, 6)
     found = detect_points(picture.image, scene.board)
     assert not found.notes

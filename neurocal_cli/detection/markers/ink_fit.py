@@ -53,6 +53,7 @@ _OFFSETS = np.linspace(-1.0, 1.0, 9)  # px, of an edge from the found vertices
 _FINER = np.geomspace(0.75, 1.33, 9)  # factors on the blur tried afterwards
 _INTERPOLATED = 1 / 6  # px^2, variance that linear interpolation adds to the blur
 _WIDEST = 10.0  # px; greatest distance from the edges at which sharpening is looked for
+_BLURRED = 2.0  # sigma from a code, which its blur reaches
 _CODES_APART = 0.8  # sigma between a profile and the inner code, below which blur makes it a part of it
 # Factors on the blur for all pixels, in two rounds; profiles with codes have up to 1.3 times the blur.
 _BY_PIXELS = ((0.68, 0.82, 1.0), (0.96, 1.04))
@@ -66,10 +67,11 @@ def fit_with_ink(raw: GridImage, ink: Ink, undo: bool = True) -> GridFit:
     """Fit a board whose cells have patterns, after sharpening by the camera is undone if `undo`."""
     ink = ink.beside(raw.grid.seen)
     look, mapped, levels, noise, shading = _first_look(raw, ink)
-    sharpening = find_sharpening(_plain_profile(raw, mapped, _gaps(raw, ink), *levels)) if undo else None
+    sigma = upper_median(look.blur[:, 0])
+    profile = _plain_profile(raw, mapped, _gaps(raw, ink), sigma, *levels) if undo else None
+    sharpening = find_sharpening(profile)
     if sharpening is not None:
         return fit_with_ink(sharpening.undone(raw, 2 * raw.grid.square), ink, undo=False)
-    sigma = upper_median(look.blur[:, 0])
     inked = InkedPixels.of(raw, ink, look)
     fitted = fit_from(inked.under(look, _FIRST_MOST), mapped, sigma, shading, levels, max(noise, raw.floor))
     look = _look_of(fitted, ink)
@@ -180,20 +182,25 @@ def _crossing(at: SmoothMap, ink: Ink) -> tuple[Lines, Lines]:
 
 
 def _profiles(
-    raw: GridImage, at: SmoothMap, lines: Lines, gaps: tuple[Array, Array], sigmas: Array, offsets: Array
+    raw: GridImage,
+    at: SmoothMap,
+    lines: Lines,
+    gaps: tuple[Array, Array, float],
+    sigmas: Array,
+    offsets: Array,
 ) -> tuple[Array, Array]:
     """Mean level, half contrast and blur (E, 3) of edges, and their offsets (E,) [px], by profiles across.
 
     The first line of a marker, at a known distance on one side, is part of the profile: the marker is of the
     other colour than the cell in which it is.
     """
-    share, side = gaps
+    share, side, clear = gaps
     # In perspective, the marker's line is not at its share of the distance to the next line.
     across = np.where(raw.edges.vertical[:, None], [1.0, 0.0], [0.0, 1.0])
     inside = raw.edges.centre + (share * side * raw.edges.light)[:, None] * across
     gap = np.abs(((at.at(inside) - lines.middle) * lines.normal).sum(axis=1))
     near = share < 0.5
-    half = np.minimum(np.where(near, _ROOM * gap, np.inf), 0.4 * lines.width)
+    half = np.minimum(np.where(near, _ROOM * gap, clear * lines.apart[:, 0]), 0.4 * lines.width)
     d = np.linspace(-1, 1, _PLACES) * half[:, None]
     image = np.asarray(raw.image, dtype=np.float32)
     seen = np.zeros(d.shape)
@@ -226,15 +233,21 @@ def _profiles(
 
 
 def _plain_profile(
-    raw: GridImage, mapped: MapFit, gaps: tuple[Array, Array], mean: Array, contrast: Array
+    raw: GridImage,
+    mapped: MapFit,
+    gaps: tuple[Array, Array, float],
+    sigma: float,
+    mean: Array,
+    contrast: Array,
 ) -> EdgeProfile | None:
     """Mean profile of the edges by the sides that have no patterns.
 
     What is beyond an edge with a pattern is what is before it, with the levels exchanged.
     """
-    lines, (gap, side) = raw.edges.lines(mapped.map), gaps
+    lines, (gap, side, clear) = raw.edges.lines(mapped.map), gaps
     offset = mapped.residual[: len(gap)] + mapped.shift[0]
-    half = np.minimum(_WIDEST, 0.35 * lines.width)
+    blank = clear * lines.apart[:, 0] - _BLURRED * sigma
+    half = np.maximum(np.minimum(np.minimum(_WIDEST, 0.35 * lines.width), blank), 0.0)
     strips = strip_pixels(raw.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
     zero, middle = (x.astype(np.float32)[:, None] for x in (offset, mean))
     patterned = (gap < 0.5)[:, None]
@@ -251,8 +264,11 @@ def _plain_profile(
     return None if found is None else replace(found, reflected=True)
 
 
-def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array]:
-    """Distance (E,) [cells] of each edge from the nearest pattern, and (E,) +1 if it is on the light side."""
+def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array, float]:
+    """Distance (E,) [cells] of each edge from the nearest pattern, and (E,) +1 if it is on the light side.
+
+    Also that of codes within dark cells.
+    """
     edges = raw.edges
     patterned = {tuple(cell): k for k, cell in enumerate(ink.cell.tolist())}
     gap, sign = np.ones(len(edges.index)), np.ones(len(edges.index))
@@ -267,4 +283,4 @@ def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array]:
                 if (ring != ink.base[k]).all():
                     gap[e] = ink.lines[0]
                     sign[e] = light * (1 if after else -1)
-    return gap, sign
+    return gap, sign, ink.gap if (ink.base < 0).all() else np.inf
