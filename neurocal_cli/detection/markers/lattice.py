@@ -81,37 +81,7 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
             best = Placed(some.only(kept), how, cells, at[kept], ground[kept], some)
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
-    return None if best is None else _completed(plane, best)
-
-
-def _completed(plane: Plane, placed: Placed) -> Placed:
-    """With the markers of which three corners agree with those of the two nearest, which give the fourth.
-
-    A quadrangle may reach beyond a corner of a tag, to the end of the square at it.
-    """
-    rest = placed.read.only(~np.isin(placed.read.number, placed.marks.number))
-    if not len(rest):
-        return placed
-    at = placed.cells.of(rest.number)
-    ground, known = plane.spread(placed.cells.corners[at]), placed.ground
-    away = np.abs(ground.mean(axis=1)[:, None] - known.mean(axis=1)).max(axis=2)
-    near = np.argsort(away, axis=1)[:, :2]
-    both = np.concatenate([ground, known[near].reshape(-1, 8, 2)], axis=1)
-    pixels = np.concatenate([rest.corners, placed.marks.corners[near].reshape(-1, 8, 2)], axis=1)
-    without = 1.0 - np.eye(4, 12)  # in turn, each of its corners
-    fourfold = np.repeat(both, 4, axis=0)
-    H = homographies(fourfold, np.repeat(pixels, 4, axis=0), np.tile(without, (len(at), 1)))
-    told = homography_at(H, fourfold).reshape(-1, 4, 12, 2)
-    error = np.sqrt(((told - pixels[:, None]) ** 2).sum(axis=3) @ without.T / 11)
-    error = np.diagonal(error, axis1=1, axis2=2)
-    least, every = error.argmin(axis=1), np.arange(len(at))
-    side = np.sqrt(_area(placed.marks.corners[near[:, 0]]) / _area(known[near[:, 0]]))
-    good = (error[every, least] < _AGREE * side + _AGREE_PX) & (away[every, near[:, 1]] < _NEAR)
-    corners = rest.corners.copy()
-    corners[every, least] = told[every, least, least]
-    marks = Marks(rest.number, corners, rest.dictionary).only(good).with_others(placed.marks)
-    order = np.concatenate([at[good], placed.at])
-    return replace(placed, marks=marks, at=order, ground=plane.spread(placed.cells.corners[order]))
+    return best
 
 
 def are_misplaced(plane: Plane, placed: Placed, size: tuple[int, int]) -> bool:
