@@ -21,12 +21,14 @@ from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.point_errors import rms
 from neurocal_cli.calibration.verdict.effects import BENDS
 from neurocal_cli.calibration.verdict.findings import (
+    EXACT,
     FEWEST,
     LEVEL,
     MISFIT,
     POOR,
     Mistake,
     Said,
+    likeliest,
     log_odds,
     pixel_spread,
     said,
@@ -48,7 +50,6 @@ _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 # Of all views (test_mistakes.py).
 ENOUGH_VIEWS = 40
 """Views that tell a mistake in all of them."""
-_BETTER = 5.0  # times smaller than the error with the rows as given
 
 Mended = Callable[[Correspondences], Correspondences | None]
 """The points without the mistake; None if they cannot have it."""
@@ -171,14 +172,14 @@ def mistake_in_all_views(points: Correspondences) -> tuple[str, str] | None:
     def misfit(world: Array) -> float:
         """Median over the views of the rms error of a homography over the spread of the pixels."""
         of_views = [_misfit(world[rows][:, axes], points.pixels[rows]) for rows in members]
-        return float(median(np.array(of_views)))
+        return max(float(median(np.array(of_views))), EXACT)
 
     given = misfit(points.world) if members else 0.0
-    for one in MISTAKES:
-        mended = one.mended(points) if given > MISFIT * _BETTER else None
-        if mended is not None and misfit(mended.world) < min(MISFIT, given / _BETTER):
-            return f"the {one.say(points)[0]}", one.advice
-    return None
+    tried = [(one, one.mended(points)) for one in MISTAKES if given > MISFIT]
+    errors = [(one, misfit(mended.world)) for one, mended in tried if mended is not None]
+    n = 2 * len(points) - 8 * points.n_views
+    told = likeliest((log_odds(given**2, error**2, n), one) for one, error in errors if error < MISFIT)
+    return next(((f"the {one.say(points)[0]}", one.advice) for one in told), None)
 
 
 def _misfit(plane: Array, pixels: Array) -> float:

@@ -61,7 +61,7 @@ _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
 # 0.0018. A board that leans by 0.006 and stands upright in all views may turn theta by as much;
 # test_a_leaning_board_is_not_good has one that leans by 0.01.
 _SKEWED = 0.004
-_LEANING = Limit(MISPRINT, 0.025)  # rad, of a target's sides
+_LEANING = Limit(MISPRINT, STRETCHED_PRINT.poor)  # rad, of a target's sides
 _UNCHECKED = (
     "the camera needs every view, so it may take in errors of single views, such as a board that bends, and "
     "its std do not include them",
