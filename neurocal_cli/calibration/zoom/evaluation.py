@@ -197,8 +197,8 @@ def baselines_of(lens: ZoomLens, scale: str | None = None) -> dict[str, Baseline
         if axes is not None:
             baselines[f"lookup{suffix}"] = _through(table, scale, partial(spline_matrix, axes, degree=1))
             baselines[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes, degree=3))
-        if x.shape[1] > 1 and len(x) >= 4:
-            baselines[f"thin_plate{suffix}"] = _through(table, scale, partial(thin_plate_matrix, x))
+        if x.shape[1] > 1 and np.linalg.matrix_rank(x - x.mean(axis=0)) == x.shape[1]:
+            baselines[f"thin_plate{suffix}"] = _through(table, scale, partial(_thin_plate_matrix, x))
     for degree in range(1, _HIGHEST_DEGREE + 1):
         powers = powers_up_to(x, degree)
         if powers.sum(axis=1).max() < degree or len(powers) >= len(x):
@@ -301,19 +301,8 @@ def spline_matrix(axes: list[Array], x: Array, degree: int) -> Array:
     return product
 
 
-def thin_plate_matrix(nodes: Array, x: Array) -> Array:
-    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, 2) anywhere, at x (n, 2).
+def _thin_plate_matrix(nodes: Array, x: Array) -> Array:
+    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, 2), not all on one line, at x (n, 2)."""
+    from scipy.interpolate import RBFInterpolator
 
-    The solution has the smallest norm, as all settings of two controls may be on one line. SciPy's
-    `RBFInterpolator` refuses those as singular.
-    """
-
-    def kernel(a: Array, b: Array) -> Array:
-        r2 = ((a[:, None] - b[None]) ** 2).sum(axis=-1)
-        return 0.5 * r2 * np.log(np.maximum(r2, 1e-300))
-
-    S, D = nodes.shape
-    plane = np.column_stack([np.ones(S), nodes])
-    system = np.block([[kernel(nodes, nodes), plane], [plane.T, np.zeros((D + 1, D + 1))]])
-    right = np.column_stack([kernel(x, nodes), np.ones(len(x)), x])
-    return np.asarray(np.linalg.lstsq(system, right.T, rcond=None)[0][:S].T)
+    return np.asarray(RBFInterpolator(nodes, np.eye(len(nodes)))(x))

@@ -220,6 +220,7 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     To be compared, a richer model starts at the tables of the simpler one; the chosen one starts anew.
     """
     best: CalibratedSettings | None = None
+    fresh: CalibratedSettings | None = None  # the first one, from random weights
     failure: DegenerateGeometryError | None = None
     known: dict[tuple[float, ...], float] = {}  # computed when a richer model is compared
     simpler: CalibratedSettings | None = None
@@ -233,7 +234,7 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
             continue
         simpler = all_settings
         if best is None:
-            best = start
+            best = fresh = start
             continue
         if len(start.rejected) < len(best.rejected):  # a setting that a richer lens follows is not wrong
             best, known = start, {}
@@ -251,7 +252,7 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     if best is None:
         assert failure is not None
         raise failure
-    return calibrate_settings(lens, best.data.model, options)
+    return best if best is fresh else calibrate_settings(lens, best.data.model, options)
 
 
 def _calibrated(

@@ -261,7 +261,7 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
         )
     refuse_gaps(lens, start.lens.points.source)
     local = each.mean(axis=0)
-    constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
+    constants = start.tables.constants if not lens.still else lens.constants[0]
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
     there = start.data.linearise(local, constants)
     rmse = np.sqrt(there.normal.cost / start.data.counts)
@@ -282,7 +282,7 @@ def other_unit(start: CalibratedSettings) -> str | None:
 def refuse_gaps(lens: ZoomLens, source: str) -> None:
     """Refuse networks that give no camera between their own settings; name one far from the others."""
     try:
-        lens.predict(middles(lens.settings))
+        lens.of_members(middles(lens.settings))
     except InputError as error:
         cause = far_value(lens.controls, lens.settings)
         raise DegenerateGeometryError(

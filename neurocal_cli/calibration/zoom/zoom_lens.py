@@ -232,18 +232,9 @@ class ZoomLens(Summarised):
             The settings are not of shape (n, D), or a scale factor is not positive, which happens only far
             outside the calibrated range.
         """
-        x = self.scaled(self._numbers(settings, 2))
+        locals_, x = self.of_members(settings), self.scaled(settings)
         pairs = [nets.local_with_jacobian(x) for nets in self._open]
-        locals_ = np.array([local for local, _ in pairs])
-        valid = are_cameras(locals_).all(axis=0)
-        if not valid.all():
-            bad = int(np.argmin(valid))
-            raise InputError(
-                "the networks give no valid camera at "
-                f"{describe(self.controls, np.atleast_2d(settings)[bad])}; "
-                "choose a setting in the calibrated range"
-            )
-        constants, offsets = _mean_constants([member.constants for member in self.members])
+        constants, offsets = self.constants
         Q = self.tables.normal.S.shape[1] - len(self.names)
         within = np.mean([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0)
         offsets = offsets[:, :Q]
@@ -254,6 +245,25 @@ class ZoomLens(Summarised):
         L = len(self.names)
         covariance[:, range(L), range(L)] += self.scatter
         return Prediction(locals_.mean(axis=0), constants, covariance)
+
+    @property
+    def constants(self) -> tuple[Constants, Array]:
+        """Mean of the members' constants, and the differences from it (m, 6)."""
+        return _mean_constants([member.constants for member in self.members])
+
+    def of_members(self, settings: Array) -> Array:
+        """Local parameters by each member (m, n, L), with the same errors as `predict`."""
+        x = self.scaled(self._numbers(settings, 2))
+        locals_ = np.array([member.nets.local(x) for member in self.members])
+        valid = are_cameras(locals_).all(axis=0)
+        if not valid.all():
+            bad = int(np.argmin(valid))
+            raise InputError(
+                "the networks give no valid camera at "
+                f"{describe(self.controls, np.atleast_2d(settings)[bad])}; "
+                "choose a setting in the calibrated range"
+            )
+        return locals_
 
 
 @frozen_dataclass(eq=False)

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.interpolate import RBFInterpolator, RectBivariateSpline, RegularGridInterpolator
+from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 from simulated_zoom import SimulatedZoom
 from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LOW, between, covered, grid, seen, truth
@@ -23,7 +23,6 @@ from neurocal_cli.calibration.zoom.evaluation import (
     evaluate_lens,
     grid_axes,
     spline_matrix,
-    thin_plate_matrix,
 )
 from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens_cameras
 from neurocal_cli.calibration.zoom.initialisation import _predicts_better
@@ -559,7 +558,6 @@ def test_interpolation_is_that_of_an_independent_library() -> None:
     np.testing.assert_allclose(spline_matrix(axes, at, 1) @ y, linear, atol=1e-12)
     spline = RectBivariateSpline(z, f, y.reshape(7, 5), kx=3, ky=3).ev(*at.T)
     np.testing.assert_allclose(spline_matrix(axes, at, 3) @ y, spline, atol=1e-6 * np.abs(spline).max())
-    np.testing.assert_allclose(thin_plate_matrix(nodes, at) @ y, RBFInterpolator(nodes, y)(at), atol=1e-6)
     assert grid_axes(nodes[1:]) is None
     powers = powers_up_to(nodes, 6)
     assert powers[:, 1].max() == 4  # five values tell no fifth power
