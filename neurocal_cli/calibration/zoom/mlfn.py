@@ -15,7 +15,7 @@ steeply towards a pole beyond the end of the range, at close focus or at the lon
 would need many settings there. Plane and rational unit together are all such functions, with the pole at
 -1 / tilt, and all parabolas (tilt 0). The rational unit is 0 at both ends of the range. Beyond them x in its
 denominator stays -1 or 1, so that extrapolation does not reach the pole. What optics gives no pole, the image
-centre, has parabolas alone: through four values of a control a hyperbola passes for any wave.
+centre, has parabolas beside its tanh units: through four values of a control a hyperbola passes for any wave.
 
 B networks of one topology are computed together: weights are (B, P).
 

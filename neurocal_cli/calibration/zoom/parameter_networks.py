@@ -260,7 +260,9 @@ def fit_committee(
         values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
         values, spread = _given(local, values, H, variance, held)
     plain = [2, 3, *range(4 + alone, L)]
-    targets = [_Targets(values[:, j], spread[:, j], pole=j not in _CENTRE) for j in plain]
+    # Without tanh units of single controls, the pole is all that bends a network to one side.
+    sparse = bool(sparse_controls(x).any())
+    targets = [_Targets(values[:, j], spread[:, j], pole=sparse or j not in _CENTRE) for j in plain]
     for scale in SCALES:
         of_alpha, derivative = to_scale(scale, values[:, 0])
         targets.append(_Targets(of_alpha, spread[:, 0] * derivative**2, derivative))
