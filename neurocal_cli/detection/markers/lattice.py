@@ -312,16 +312,15 @@ def _refined(
     sides = np.hypot(cell[..., 0], cell[..., 1]) * least  # (N, 2) [px]
     twist = np.abs(cell[:, 0, 0] * cell[:, 1, 1] - cell[:, 0, 1] * cell[:, 1, 0])
     narrow = np.minimum(sides.min(axis=1), twist * least.prod(axis=1) / np.maximum(sides.max(axis=1), 1e-9))
+    most = np.maximum(_MOVED * sides.min(axis=1), _MOVED_PX)
     new = np.full(start.shape, np.nan)
     for sigma in (1.0, 1.5, 2.5):
         mine = (sigma <= np.maximum(narrow / 6, 1.0)) & np.isfinite(start).all(axis=1)
         if mine.any():
             refined = refine_saddles(image, start[mine], sigma, rounds=5)
-            # Wide windows reach beyond the image earlier.
-            new[mine] = np.where(np.isfinite(refined), refined, new[mine])
-    moved = np.hypot(*(new - start).T)
-    side = sides.min(axis=1)
-    new[~(moved < np.maximum(_MOVED * side, _MOVED_PX))] = np.nan
+            # Wide windows reach beyond the image earlier, and to the ink of markers.
+            near = np.hypot(*(refined - start[mine]).T) < most[mine]
+            new[mine] = np.where(near[:, None], refined, new[mine])
     quadrant = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
     # Between the vertex and the markers of a ChArUco board.
     tags = isinstance(plane, TagPlane) or plane.markers is None
