@@ -14,8 +14,9 @@ functions (A x + B) / (1 + C x) of the positions of groups of glass and of the o
 steeply towards a pole beyond the end of the range, at close focus or at the long end of a zoom. Tanh units
 would need many settings there. Plane and rational unit together are all such functions, with the pole at
 -1 / tilt, and all parabolas (tilt 0). The rational unit is 0 at both ends of the range. Beyond them x in its
-denominator stays -1 or 1, so that extrapolation does not reach the pole. What optics gives no pole, the image
-centre, has parabolas beside its tanh units: through four values of a control a hyperbola passes for any wave.
+denominator stays -1 or 1, so that extrapolation does not reach the pole. At four
+values of a control, a hyperbola passes for any wave; there the image centre, to which no optics gives a pole,
+has parabolas alone beside its tanh units.
 
 B networks of one topology are computed together: weights are (B, P).
 
@@ -340,7 +341,7 @@ def updated_precision(
     """
     kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
     least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
-    if max(len(np.unique(column)) for column in x.T) <= _ENOUGH_VALUES:
+    if few_values(x):
         least[: 5 + D] = _LEAST_FEW
     least[2 : 2 + D][sparse] = _LEAST_SPARSE
     least[6 + D] = _LEAST_TILT
@@ -356,6 +357,11 @@ def prior_precision(topology: Topology, precision: Array) -> Array:
     """Precision of each weight's prior, (..., G) -> (..., P)."""
     group = topology.groups
     return np.where(group < 0, _FLAT, np.asarray(precision)[..., np.maximum(group, 0)])
+
+
+def few_values(x: Array) -> bool:
+    """Whether no control has more than four distinct values in the settings (S, D)."""
+    return max(len(np.unique(column)) for column in x.T) <= _ENOUGH_VALUES
 
 
 def sparse_controls(x: Array) -> NDArray[np.bool_]:

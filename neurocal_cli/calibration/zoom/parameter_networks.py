@@ -41,6 +41,7 @@ from neurocal_cli.calibration.verdict.findings import LEVEL, log_odds
 from neurocal_cli.calibration.zoom.mlfn import (
     Schedule,
     Topology,
+    few_values,
     prior_precision,
     respond,
     respond_with_jacobian,
@@ -260,9 +261,9 @@ def fit_committee(
         values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
         values, spread = _given(local, values, H, variance, held)
     plain = [2, 3, *range(4 + alone, L)]
-    # Without tanh units of single controls, the pole is all that bends a network to one side.
-    sparse = bool(sparse_controls(x).any())
-    targets = [_Targets(values[:, j], spread[:, j], pole=sparse or j not in _CENTRE) for j in plain]
+    # Plane and rational unit have four weights of a control, so four values contradict no hyperbola.
+    any_fits = few_values(x) and not sparse_controls(x).any()
+    targets = [_Targets(values[:, j], spread[:, j], pole=not (any_fits and j in _CENTRE)) for j in plain]
     for scale in SCALES:
         of_alpha, derivative = to_scale(scale, values[:, 0])
         targets.append(_Targets(of_alpha, spread[:, 0] * derivative**2, derivative))
