@@ -173,15 +173,17 @@ def read_codes(grey: NDArray[np.uint8]) -> tuple[list[tuple[Marks, int]], list[t
     result is what the negative of the image shows.
     """
     seen: tuple[dict[tuple[str, int], Marks], ...] = ({}, {})
+
+    def add(codes: dict[tuple[str, int], Marks], found: Iterable[tuple[Marks, int]]) -> None:
+        for marks, border in found:
+            codes[marks.dictionary, border] = marks.with_others(codes.get((marks.dictionary, border)))
+
     for look in looks_at(grey):
         every = candidates(look)
-        for codes, found in zip(
-            seen, (codes_in(grey, every), _codes_of_negative(grey, every, look)), strict=True
-        ):
-            for marks, border in found:
-                codes[marks.dictionary, border] = marks.with_others(codes.get((marks.dictionary, border)))
+        add(seen[0], codes_in(grey, every))
         if max(map(len, seen[0].values()), default=0) >= _ENOUGH:
             break
+        add(seen[1], _codes_of_negative(grey, every, look))
     positive, negative = ([(marks, border) for (_, border), marks in codes.items()] for codes in seen)
     return positive, negative
 
@@ -203,9 +205,9 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
         which, light = _cells(grey, H, bits, border)
         for dictionary in USUAL if len(which) >= _FEWEST else ():
             if DICTIONARIES[dictionary] == bits:
-                marks = _marks(grey, corners[which], light, dictionary)
+                marks = _marks(corners[which], light, dictionary)
                 if len(marks) >= _FEWEST:
-                    yield marks, border
+                    yield _on_edges(grey, marks), border
 
 
 def markers_in(
@@ -214,16 +216,11 @@ def markers_in(
     """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
     H, corners = _framed(grey, corners)
     which, light = _cells(grey, H, DICTIONARIES[dictionary], border, _ROUGHLY_WRONG)
-    return _marks(grey, corners[which], light, dictionary, first, count)
+    return _on_edges(grey, _marks(corners[which], light, dictionary, first, count))
 
 
 def _marks(
-    grey: NDArray[np.uint8],
-    corners: Array,
-    light: NDArray[np.bool_],
-    dictionary: str,
-    first: int = 0,
-    count: int | None = None,
+    corners: Array, light: NDArray[np.bool_], dictionary: str, first: int = 0, count: int | None = None
 ) -> Marks:
     """The markers within quadrangles (N, 4, 2), by their light cells.
 
@@ -237,8 +234,7 @@ def _marks(
     number, one = np.unique(number[k], return_index=True)
     # The marker's first corner is that of the quadrangle to which the bits were turned.
     order = (np.arange(4) + turn[k[one], None]) % 4
-    corners = _on_edges(grey, np.take_along_axis(corners[k[one]], order[..., None], axis=1))
-    return Marks(number, corners, dictionary)
+    return Marks(number, np.take_along_axis(corners[k[one]], order[..., None], axis=1), dictionary)
 
 
 # Sides by their first corner: twice four places along each, and depths outwards, in sides of the marker.
@@ -255,11 +251,12 @@ _ACROSS_SIDES = (
 ).reshape(-1, 2)
 
 
-def _on_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
-    """Quadrangles (N, 4, 2) with their sides moved to where the dark borders of markers within them end.
+def _on_edges(grey: NDArray[np.uint8], marks: Marks) -> Marks:
+    """Markers with their sides moved to where their dark borders end, which is exact to a tenth of a pixel.
 
     Where squares touch the corners of tags, only the inner outlines of blurred borders may be found.
     """
+    corners = marks.corners
     H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     level = _sampled(grey, H, _ACROSS_SIDES).reshape(len(H), 8, len(_FIRST), len(_OUTWARDS)).mean(axis=2)
     dark = level[..., :_WITHIN_BORDER].argmin(axis=2)[..., None]
@@ -277,7 +274,7 @@ def _on_edges(grey: NDArray[np.uint8], corners: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         met = met[..., :2] / met[..., 2:]
     seen = (half - low > 0.5 * _CONTRAST).all(axis=(1, 2)) & np.isfinite(met).all(axis=(1, 2))
-    return np.where(seen[:, None, None], met, corners)
+    return replace(marks, corners=np.where(seen[:, None, None], met, corners))
 
 
 def numbers_in(
