@@ -20,7 +20,7 @@ from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.links import find_links, find_seeds, linked_group
 from neurocal_cli.detection.finding.overlaps import split_at_folds
-from neurocal_cli.detection.finding.saddles import levels_of, refine_saddles
+from neurocal_cli.detection.finding.saddles import grey_levels, pyramid, refine_saddles
 
 cv2 = pytest.importorskip("cv2")
 
@@ -355,7 +355,7 @@ def test_a_single_line_of_vertices_has_no_fold() -> None:
 @pytest.mark.parametrize("name", slow_but(("noise 12",), ("base", "noise 12", "k1 -0.3")))
 def test_links_put_a_plain_board_together(name: str) -> None:
     shot = picture(name, FIRST)
-    level = levels_of(shot.image)[-1]
+    level = pyramid(grey_levels(shot.image))[-1]
     links = find_links(level)
     assert links is not None
     _, members = linked_group(links, int(find_seeds(links)[0, 1, 1]))
@@ -368,7 +368,7 @@ def test_links_put_a_plain_board_together(name: str) -> None:
 
 def test_saddles_settle_where_they_are() -> None:
     shot = picture("base", FIRST)
-    image, vertices = levels_of(shot.image)[0].image, shot.truth.planes[0].vertices.reshape(-1, 2)
+    image, vertices = pyramid(grey_levels(shot.image))[0].image, shot.truth.planes[0].vertices.reshape(-1, 2)
     start = vertices + np.random.default_rng(1).uniform(-1, 1, vertices.shape)
     settled = refine_saddles(image, start, 1.5)
     assert np.abs(settled - vertices).max() < 0.1

@@ -29,7 +29,7 @@ from neurocal_cli.detection.finding.overlaps import (
     split_at_folds,
     trim_overlaps,
 )
-from neurocal_cli.detection.finding.saddles import Level, dense_parts, levels_of, pyramid
+from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid, squares_of
 
@@ -58,7 +58,7 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     clutter and no third vertex tests their lines.
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
-    levels = levels_of(image)
+    levels = pyramid(grey_levels(image))
     lattices = [x for x in _find(levels, wanted) if are_squares(levels[0].image, x.pixels, x.dark)]
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 

@@ -93,14 +93,6 @@ class Level:
         return max(float(np.median(np.abs(sparse))) / 0.6745, _LEAST_NOISE)
 
 
-def levels_of(image: NDArray[np.generic]) -> list[Level]:
-    """Halve an image (height, width) of 8 or 16 bits, or of real numbers of any range, repeatedly.
-
-    The original is first; there are no levels if it is too small for a board.
-    """
-    return pyramid(grey_levels(image))
-
-
 def grey_levels(image: NDArray[np.generic]) -> Image:
     """Convert the image to float32 and the grey levels of 8 bits."""
     if image.dtype == np.uint8:
@@ -118,7 +110,10 @@ def grey_levels(image: NDArray[np.generic]) -> Image:
 
 
 def pyramid(image: Image) -> list[Level]:
-    """Halve an image with the grey levels of 8 bits repeatedly; see `levels_of`."""
+    """Halve an image with the grey levels of 8 bits repeatedly.
+
+    The original is first; there are no levels if it is too small for a board.
+    """
     levels = []
     current, scale = image, 1
     while min(current.shape) >= (16 if scale == 1 else _SMALLEST):

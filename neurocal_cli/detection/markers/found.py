@@ -281,7 +281,7 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
                 "their spacing is not told; describe the board by --board, for example "
                 f"aprilgrid:{size}:88:0.3"
             )
-        border = _border(plane, seen)
+        border = _border(plane, images)
         return replace(plane, spacing=simple(spacing, _CLOSE_SPACING), border=border)
     rough, width = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
     found = [_side(picture, rough, width) for picture in seen]
@@ -293,21 +293,15 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
     return replace(plane, markers=replace(markers, side=ratio * plane.square))
 
 
-def _border(plane: TagPlane, pictures: Sequence[_Picture]) -> int:
-    """Width of the border of tags, with which most of their codes are read between the found vertices."""
+def _border(plane: TagPlane, images: Sequence[tuple[NDArray[np.generic], Marks]]) -> int:
+    """Width of the border of tags, with which most of their codes are read between their outer edges."""
     assert plane.markers is not None
     score = {plane.border: 1, 3 - plane.border: 0}
-    for pixels, _, light in pictures:
-        rows, cols = pixels.shape[:2]
-        first = pixels[: rows - 1 : 2, : cols - 1 : 2], pixels[: rows - 1 : 2, 1::2]
-        second = pixels[1::2, 1::2], pixels[1::2, : cols - 1 : 2]
-        # y points upwards.
-        corners = np.stack([second[1], second[0], first[1], first[0]], axis=2).reshape(-1, 4, 2)
-        number = plane.markers.first_id + np.arange(len(corners))
-        whole = np.isfinite(corners).all(axis=(1, 2))
+    for image, marks in images:
+        light = grey_levels(image)
         for border in score:
-            read = numbers_in(light, corners[whole], plane.markers.dictionary, border)
-            score[border] += int((read == number[whole]).sum())
+            read = numbers_in(light, marks.corners, plane.markers.dictionary, border)
+            score[border] += int((read == marks.number).sum())
     return max(score, key=lambda border: score[border])
 
 
