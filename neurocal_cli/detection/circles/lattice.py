@@ -27,7 +27,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.appearance import departure_from_circles
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import predict_vertices
-from neurocal_cli.detection.finding.saddles import Level, dense_parts, grey_levels, interpolate
+from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -249,9 +249,9 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     kept = np.isfinite(area)
     if kept.sum() < least:
         return None
-    placed = _placed(plane, blobs, index[kept], at[kept], grey)
-    places = plane.spread(placed.place.astype(float))
     light = grey.astype(np.float32)
+    placed = _placed(plane, blobs, index[kept], at[kept], light)
+    places = plane.spread(placed.place.astype(float))
     departure, _ = departure_from_circles(light, places, placed.centre, placed.area, described=True)
     if departure > _DEPARTURE:
         raise NoBoardError(
@@ -340,7 +340,7 @@ def _placed(
     blobs: Blobs,
     index: NDArray[np.int64],
     at: NDArray[np.intp],
-    grey: NDArray[np.uint8],
+    image: Image,
 ) -> PlacedCircles:
     """Compare a lattice with the board in all bases and places."""
     board = _lattice_of(plane)
@@ -354,11 +354,11 @@ def _placed(
                 found.append(places)
     if len(set(but_one)) == 1 and not found:
         kept = np.arange(len(index)) != but_one[0]
-        return _placed(plane, blobs, index[kept], at[kept], grey)
+        return _placed(plane, blobs, index[kept], at[kept], image)
     names = [np.array([board[tuple(one)] for one in places.tolist()]) for places in found]
     several = bool(but_one) and not found
     if len(index) < len(board) and len(names) > 1 and not _are_turns(plane, names):
-        beside = [_paper_beside(places, board, blobs, at, grey) for places in found]
+        beside = [_paper_beside(places, board, blobs, at, image) for places in found]
         kept = [k for k, (shown, _) in enumerate(beside) if shown <= _MOST_WRONG]
         names = [names[k] for k in kept]
         several = any(beside[k][1] > _MOST_WRONG for k in kept)
@@ -381,7 +381,7 @@ def _paper_beside(
     board: dict[tuple[int, int], tuple[int, int]],
     blobs: Blobs,
     at: NDArray[np.intp],
-    grey: NDArray[np.uint8],
+    image: Image,
 ) -> tuple[float, float]:
     """Where there is paper beside a part of the board, at its places (N, 2), and where it should be.
 
@@ -401,10 +401,10 @@ def _paper_beside(
     share = [-0.5, 0.0, 0.5 * radius, 0.9 * radius, *np.linspace(0.5, 1 - _WITHIN * radius, _SAMPLES)]
     start = np.stack([pixels[row + r, col + c] for c, r in ((1, 0), (-1, 0), (0, 1), (0, -1))])
     way = start[:, :, None] + np.array(share)[:, None] * (next_to.points - start)[:, :, None]
-    light = interpolate(grey.astype(np.float32), np.nan_to_num(way))
+    light = interpolate(image, np.nan_to_num(way))
     paper, ink = light[..., 0], light[..., 1:4].min(axis=-1)
     bare = light[..., 4:].min(axis=-1) > ink + np.maximum(_BARE * (paper - ink), _STEPS[0])
-    inside = ((way >= 0) & (way <= np.array(grey.shape[::-1]) - 1)).all(axis=(2, 3))
+    inside = ((way >= 0) & (way <= np.array(image.shape[::-1]) - 1)).all(axis=(2, 3))
     known = np.isfinite(start[..., 0])
     bare, inside = ((one | ~known).all(axis=0) for one in (bare, inside))
     shown, missing = bare & inside & on_board, ~bare & inside & ~on_board
