@@ -161,9 +161,9 @@ class InkedPixels:
             blurred = _Blurred.of(slopes, look.blur[self.shown], look.shift, look.tails)
             change = blurred.pattern(a, b, self.ink.lines, self.ink.inner)[self.used]
             u, v = self.pixels[self.used].T.astype(np.intp)
-            np.add.at(light, (v, u), change)  # some pixels are near the edges of two cells
-            left = np.abs(change) > most
-            result[v[left], u[left]] = np.nan
+            place = v * self.raw.size[0] + u
+            np.add.at(light.reshape(-1), place, change)  # some pixels are near the edges of two cells
+            result.reshape(-1)[place[np.abs(change) > most]] = np.nan
         return replace(self.raw, image=result, ink=light)
 
 
