@@ -48,9 +48,9 @@ from neurocal_cli.observations.markers import DICTIONARIES, code_count
 _ENOUGH = 4  # markers that are no chance
 _MOST = 0.5  # share of the markers after which no other scale is tried
 _WITH_SQUARES = 0.5  # share of the corners of tags that are vertices if there are squares at them
-# Distance of markers as read over the described one: 0.97 to 1.06 (once 1.17) in 60 views, as the sides of
-# markers are read too small.
-_SPACED = 0.95, 1.2
+# Distance of markers as read over the described one: 0.92 to 1.0 in 45 views of a blur of up to a twelfth of
+# a side, which hides the darkest part of borders; more where the light grows over the edges of small ones.
+_SPACED = 0.9, 1.2
 # Greatest shift of measured edges, towards the light and towards the dark [px], and by ink [sides]. It is at
 # most 0.01 px in rendered views, and 0.2 to 0.4 px towards the dark with gamma 2.2 and a blur of 0.5 to 1.2
 # px; spacings of 0.2 and 0.25 differ by 0.02 sides.
