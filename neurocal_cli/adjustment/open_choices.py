@@ -62,8 +62,9 @@ _DECENTRED = (*_FISHEYE, (("p1", "p2"), 1, 0.0015))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
 # Prior odds that a group is present, by the factor of its typical size: half a decade above and below. k3 is
-# small in most lenses.
+# small in most lenses, and p1 and p2 are, but hardly ever absent.
 _ODDS, _ODDS_OF_K3 = {3.0: 1.5, 0.3: 1.5}, {3.0: 0.75, 0.3: 2.25}
+_ODDS_OF_P = dict.fromkeys((3.0, 0.3, 0.1), 6.0)
 # A fisheye that stands for an ordinary lens, whose polynomials fold in the corners: such lenses have p1 and
 # p2, and those of most are small.
 _ODDS_ORDINARY = {3.0: 50.0, 0.3: 100.0, 0.03: 50.0}
@@ -162,7 +163,7 @@ def open_at_points(
         if places:
             groups.append(np.array(places))
     everything = np.append(free[:5], np.ones(len(names), dtype=bool))
-    odds = {"k3": _ODDS_OF_K3, "p1": _ODDS_ORDINARY if ordinary else _ODDS}
+    odds = {"k3": _ODDS_OF_K3, "p1": _ODDS_ORDINARY if ordinary else _ODDS if wide else _ODDS_OF_P}
     is_open, left_out = (
         np.array([False] * 5 + [name in some for name in names])[everything]
         for some in (open_names, set(names) - estimated)
