@@ -269,10 +269,11 @@ def edge_profile(
 ) -> EdgeProfile | None:
     """Average the pixels around edges with offsets and levels (E,); None if there are too few.
 
-    The pixels (E, N) have distances from lines [px] and values; only those `inside` are used.
+    The pixels (E, N) have distances from lines [px] and values; only those `inside` are used, and no edge
+    without contrast, as where the board is covered.
     """
     reach = np.abs(d * inside).max(axis=1)
-    wide = reach >= _NARROWEST
+    wide = (reach >= _NARROWEST) & (contrast > 0)
     if np.count_nonzero(wide) < _FEWEST:
         return None
     some = np.flatnonzero(wide)[:: -(-np.count_nonzero(wide) // _MOST)]

@@ -93,7 +93,8 @@ def _few_steps(
     blur = known[:, 2]
     data = edge_pixels(grid_image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
     data = data.weighed(np.full_like(data.root, 1 / noise))
-    spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
+    contrast = np.maximum(known[:, 1:2], noise)  # none where the board is covered
+    spread = known * [0.0, 0.0, _LOOSE_BLUR] + contrast * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
     shape = _blur_profiles(lines, float(blur[0]))[-1]
     return fit_batch(edge_model, data, start, prior, shape, _FEW_STEPS, 0)
