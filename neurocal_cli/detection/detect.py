@@ -24,7 +24,7 @@ from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 
-_FEWEST = 8  # points, or all that the board has; fewer determine little more than the pose
+_FEWEST = 6  # points, or all that the board has: as many as two markers show at least
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge
 _PREFIXES = ("h:", "v:", "")  # by kind: prefix of a point's id
 

@@ -147,14 +147,20 @@ def test_points_that_are_no_numbers_are_rejected(monkeypatch: pytest.MonkeyPatch
     Correspondences.from_detections({"a": found})
 
 
-def test_a_handful_of_points_is_not_a_view(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("rejected", "reason"),
+    [(86, "only 5 of 91 points of the board can be measured"), (0, "only 5 points of the board are seen")],
+)
+def test_a_handful_of_points_is_not_a_view(
+    monkeypatch: pytest.MonkeyPatch, rejected: int, reason: str
+) -> None:
     def few(measured: Measured) -> Measured:
         names = ("kind", "index", "pixels", "covariance")
-        return replace(measured, **{name: getattr(measured, name)[:7] for name in names}, rejected=86)
+        return replace(measured, **{name: getattr(measured, name)[:5] for name in names}, rejected=rejected)
 
     seen = detected("base", 0)[1]
     measuring(monkeypatch, few)
-    with pytest.raises(NoBoardError, match="only 7 of 93 points of the board can be measured"):
+    with pytest.raises(NoBoardError, match=reason):
         detect_points(seen.image, BOARD)
 
 

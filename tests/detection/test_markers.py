@@ -176,8 +176,13 @@ def test_a_corner_of_the_board_is_enough() -> None:
     assert 8 <= plane.vertices_visible.sum() <= 16
     assert len(error) >= 0.65 * plane.vertices_visible.sum()  # those at the image border are too near to it
     assert np.abs(error).max() < 0.05
-    with pytest.raises(NoBoardError, match="only 7 points of the board are seen; show more of it"):
-        detect_points(np.ascontiguousarray(picture.image[:200, :280]), scene.board, "vertices")
+    # Two markers.
+    found = detect_points(np.ascontiguousarray(picture.image[:200, :260]), scene.board, "vertices")
+    error, _ = errors_of(found, picture)
+    assert len(error) == 6
+    assert np.abs(error).max() < 0.05
+    with pytest.raises(NoBoardError, match="of 5 points of the board can be measured"):
+        detect_points(np.ascontiguousarray(picture.image[:200, :240]), scene.board, "vertices")
 
 
 @pytest.mark.parametrize(
