@@ -3,8 +3,9 @@
 A selected model may lack coefficients that the real lens has: p1 and p2, which no fisheye has, are correlated
 with the image centre, k3 with k1 and k2. Or it has them only because noise made them large. All these
 coefficients are called open here. Each group of them is either absent or has a Gaussian prior, whose width is
-three times or a third of the typical size in real lenses (spike and slab, George and McCulloch 1993). Each
-group has a width of its own: small k2 and k3 do not tell that p1 and p2 are small.
+three times or a third of the typical size in real lenses, that of p1 and p2 also a tenth (spike and slab,
+George and McCulloch 1993). Each group has a width of its own: small k2 and k3 do not tell that p1 and p2 are
+small.
 To second order around the minimum, all these models follow from one normal matrix. Let w_m be the posterior
 probability of model m, P_m and o_m its posterior covariance and mean of the open coefficients o, o_r their
 reported values (0 if they were left out), and T = dc/do the response of the camera parameters c. Then
@@ -62,7 +63,7 @@ _DECENTRED = (*_FISHEYE, (("p1", "p2"), 1, 0.0015))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
 # Prior odds that a group is present, by the factor of its typical size: half a decade above and below. k3 is
-# small in most lenses, and p1 and p2 are, but hardly ever absent.
+# small in most lenses. So are p1 and p2, down to a tenth, but they are hardly ever absent.
 _ODDS, _ODDS_OF_K3 = {3.0: 1.5, 0.3: 1.5}, {3.0: 0.75, 0.3: 2.25}
 _ODDS_OF_P = dict.fromkeys((3.0, 0.3, 0.1), 6.0)
 # A fisheye that stands for an ordinary lens, whose polynomials fold in the corners: such lenses have p1 and

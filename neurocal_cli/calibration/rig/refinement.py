@@ -118,10 +118,10 @@ def with_missing_coefficients(fit: RigFit, names: Sequence[str]) -> tuple[RigFit
     for side, own in shown.items():
         model = next((m for m in POLYNOMIAL_MODELS if own | of_all <= set(coefficient_names(m))), "")
         if model and model != lenses[side].model:
-            k = np.zeros(len(coefficient_names(model)))
-            k[: len(lenses[side].k)] = lenses[side].k
-            calibrations[side] = replace(calibrations[side], distortion_model=model, distortion=k)
-            lenses[side] = replace(lenses[side], model=model, k=k)
+            lenses[side] = lenses[side].with_model(model)
+            calibrations[side] = replace(
+                calibrations[side], distortion_model=model, distortion=lenses[side].k
+            )
     if all(new is old for new, old in zip(lenses, fit.state.cameras, strict=True)):
         return fit, []
     problem = rig_problem(calibrations, [observed.view for observed in fit.problem.observations])

@@ -260,7 +260,7 @@ def fit_committee(
         choose(j, nets)
         values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
         values, spread = _given(local, values, H, variance, held)
-    plain = [2, 3, *range(4 + alone, L)]
+    plain = [*_CENTRE, *range(4 + alone, L)]
     # Plane and rational unit have four weights of a control, so four values contradict no hyperbola.
     any_fits = few_values(x) and not sparse_controls(x).any()
     targets = [_Targets(values[:, j], spread[:, j], pole=not (any_fits and j in _CENTRE)) for j in plain]
