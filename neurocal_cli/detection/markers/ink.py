@@ -233,26 +233,15 @@ class _Blurred:
 
     def pattern(self, a: Single, b: Single, lines: Array, cells: Array) -> Real:
         """Blurred light (N, M) of cells (N, n, n) ``[b, a]`` between lines along both axes, 0 around them."""
-        signs = np.repeat(_SIGNS, len(lines))
-        moved_a, moved_b = (
-            np.tile(lines, 2) + shift[:, None] * signs for shift in (self.shift_a, self.shift_b)
+        corners, signs = _displaced(np.pad(cells, ((0, 0), (1, 1), (1, 1)))), np.repeat(_SIGNS, len(lines))
+        # Most lines are moved in one direction only, as their edges have one polarity.
+        on_a, on_b = corners.any(axis=(0, 1)), corners.any(axis=(0, 2))
+        W = _single(corners[:, on_b][:, :, on_a].swapaxes(1, 2))
+        (za, ea, pa), (zb, eb, pb) = (
+            self._profile(x, (np.tile(lines, 2) + shift[:, None] * signs)[:, some], s)
+            for x, shift, some, s in ((a, self.shift_a, on_a, self.a), (b, self.shift_b, on_b, self.b))
         )
-        return self._sum(a, b, moved_a, moved_b, _displaced(np.pad(cells, ((0, 0), (1, 1), (1, 1)))))
-
-    def _profile(self, z: Real) -> tuple[Real, Real]:
-        """Profile of an edge and the normal density at distances in sigma."""
-        value, _, density = profile(z.reshape(1, -1), _single(self.tails))
-        return value.reshape(z.shape), density.reshape(z.shape)
-
-    def _sum(self, a: Single, b: Single, lines_a: Array, lines_b: Array, weights: Array) -> Real:
-        """Sum over corners ``weights[:, j, i]`` at (lines_a[:, i], lines_b[:, j])."""
-        W = _single(weights)
-        za, zb = (
-            (x[..., None] - _single(lines)[:, None]) / s[..., None]
-            for x, lines, s in ((a, lines_a, self.a), (b, lines_b, self.b))
-        )
-        (ea, pa), (eb, pb) = (self._profile(z) for z in (za, zb))
-        total = ((0.5 * (1 + eb)) @ W * (0.5 * (1 + ea))).sum(axis=2)
+        total = (W @ eb * ea).sum(axis=1)
         count = next(n for limit, n in _TERMS if np.abs(self.rho).max() <= limit)
         rho = _single(self.rho[:, None])
         power = np.ones_like(rho)
@@ -260,10 +249,16 @@ class _Blurred:
         before_a, now_a, before_b, now_b = 0 * pa, pa, 0 * pb, pb
         for n in range(1, count + 1):
             power *= rho / np.float32(n)
-            total += power * ((now_b @ W) * now_a).sum(axis=2)
+            total += power * (W @ now_b * now_a).sum(axis=1)
             before_a, now_a = now_a, za * now_a - (n - 1) * before_a
             before_b, now_b = now_b, zb * now_b - (n - 1) * before_b
         return total
+
+    def _profile(self, x: Single, lines: Array, sigma: Single) -> tuple[Single, Single, Single]:
+        """Distances (N, L, M) in sigma of pixels from lines (N, L), the light of an edge there, and density."""
+        z = (x[:, None] - _single(lines)[..., None]) / sigma[:, None]
+        value, _, density = profile(z.reshape(1, -1), _single(self.tails))
+        return z, 0.5 * (1 + value.reshape(z.shape)), density.reshape(z.shape)
 
 
 def _displaced(cells: Array) -> Array:
