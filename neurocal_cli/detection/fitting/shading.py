@@ -30,7 +30,11 @@ _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN, to avoid division by 0
 _NEAREST = 2  # the distance of so many nearest levels, for each term, is the width of the weights
-_POWERS = [(n - k, k) for n in range(3) for k in range(n + 1)]  # of x and y, by growing degree
+# (3, 6, 6) coefficients of a polynomial in x and y, and of its derivatives by both, from its own.
+_DERIVATIVES = np.zeros((3, 6, 6))
+_DERIVATIVES[0] = np.eye(6)
+_DERIVATIVES[1, [0, 1, 2], [1, 3, 4]] = 1, 2, 1
+_DERIVATIVES[2, [0, 1, 2], [2, 4, 5]] = 1, 1, 2
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 _EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which polynomials are sufficient
 _CLEARLY = 0.8  # ratio of errors below which a richer description of the light predicts levels better
@@ -53,15 +57,13 @@ class Polynomial:
     """A level as a polynomial of the place, scaled by the frame."""
 
     frame: Frame
-    coefficients: Array  # (M,) [DN] of 1, x, y, x^2, x y, y^2
+    coefficients: Array  # (6,) [DN] of 1, x, y, x^2, x y, y^2
     spread: float  # [DN^2] variance of single squares around it, including that of itself
 
     def at(self, place: Array) -> tuple[Array, Array, Array]:
         """Level (N,), slopes (N, 2) [1/px] and variance (N,) of single levels at places (N, 2)."""
-        count = len(self.coefficients)
-        slopes = [terms @ self.coefficients for terms in _polynomial_slopes(self.frame, place, count)]
-        level = polynomial_terms(self.frame, place, count) @ self.coefficients
-        return level, np.stack(slopes, axis=-1), np.full(len(place), self.spread)
+        found = polynomial_terms(self.frame, place, 6) @ (_DERIVATIVES @ self.coefficients).T
+        return found[:, 0], found[:, 1:] / self.frame.unit, np.full(len(place), self.spread)
 
     def off(self, levels: Levels) -> Array:
         """Differences (N,) of levels from it [DN]."""
@@ -276,14 +278,6 @@ def excess_variance(residual: Array, variance: Array) -> float:
 
 
 def polynomial_terms(frame: Frame, place: Array, count: int) -> Array:
-    """1, x, y, x^2, x y, y^2, x^3, ... of places (N, 2) [px], scaled by the frame; (N, count)."""
+    """1, x, y, x^2, x y, y^2 of places (N, 2) [px], scaled by the frame; (N, count)."""
     x, y = ((place - frame.centre) / frame.unit).T
-    return np.stack([x**a * y**b for a, b in _POWERS[:count]], axis=-1)
-
-
-def _polynomial_slopes(frame: Frame, place: Array, count: int) -> tuple[Array, Array]:
-    """Derivatives of `polynomial_terms` by u and by v [1/px]."""
-    x, y = ((place - frame.centre) / frame.unit).T
-    du = np.stack([a * x ** max(a - 1, 0) * y**b for a, b in _POWERS[:count]], axis=-1)
-    dv = np.stack([b * x**a * y ** max(b - 1, 0) for a, b in _POWERS[:count]], axis=-1)
-    return du / frame.unit, dv / frame.unit
+    return np.array([np.ones_like(x), x, y, x * x, x * y, y * y][:count]).T
