@@ -15,6 +15,7 @@ median half contrasts.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from itertools import chain
 
 import numpy as np
@@ -363,17 +364,13 @@ class EdgeShifts:
 
     blur: BoardBlur | FieldBlur
     shading: Shading
-    middle: tuple[float, float, float]  # medians of blur [px], mean level and half contrast [DN]
+    edges: Lines  # those of the board
     used: tuple[range, ...] = ()  # the required ones of `_KINDS`
 
-    @classmethod
-    def of(
-        cls, blur: BoardBlur | FieldBlur, shading: Shading, lines: Lines, used: tuple[range, ...] = ()
-    ) -> EdgeShifts:
-        """Terms for the edges of a board."""
-        mean, contrast = shading.at(lines.middle)
-        middle = upper_median(blur.at(lines)[0]), upper_median(mean), upper_median(contrast)
-        return cls(blur, shading, middle, used)
+    @cached_property
+    def middle(self) -> tuple[float, ...]:
+        """Medians of blur [px], mean level and half contrast [DN] of the board's edges."""
+        return tuple(map(upper_median, (self.blur.at(self.edges)[0], *self.shading.at(self.edges.middle))))
 
     def terms(self, lines: Lines) -> Array:
         """(E, K) derivatives of the shifts of edges by the unknowns; the first is the common shift."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +91,7 @@ class GridFit:
     noise: PixelNoise
     good: NDArray[np.bool_]  # (E,) edges that passed the quality tests
 
-    @property
+    @cached_property
     def blur(self) -> BoardBlur | FieldBlur:
         """Blur of the board, from the fits of all edges."""
         return board_blur(self.fit, self.lines, self.good, self.map.map)
@@ -175,7 +176,7 @@ def fit_from(
     # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
     index = mapped.model_index
     models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
-    shifts = EdgeShifts.of(board_blur(fit, lines, good, mapped.map), shading, lines)
+    shifts = EdgeShifts(board_blur(fit, lines, good, mapped.map), shading, lines)
     # Only large shifts matter here; those of paper boards would cost a tenth of the time.
     chosen, shifts = _selected(grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY)
     good &= chosen.weight[: len(good)] > 0
@@ -281,7 +282,7 @@ def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
     trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, ANCHOR**2)
     # More accurate edges may need a richer model.
     richer = first.map.map.models[first.map.model_index :]
-    shifts = EdgeShifts.of(blur, shading, lines, first.shifts.used)
+    shifts = EdgeShifts(blur, shading, lines, first.shifts.used)
     mapped, shifts = _selected(grid_image, first.map, lines, fit, trusted, shifts, richer)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
