@@ -255,7 +255,7 @@ class _Blurred:
         return total
 
     def _profile(self, x: Single, lines: Array, sigma: Single) -> tuple[Single, Single, Single]:
-        """Distances (N, L, M) in sigma of pixels from lines (N, L), the light of an edge there, and density."""
+        """Distances (N, L, M) of pixels from lines (N, L) in sigma, light and density of an edge there."""
         z = (x[:, None] - _single(lines)[..., None]) / sigma[:, None]
         value, _, density = profile(z.reshape(1, -1), _single(self.tails))
         return z, 0.5 * (1 + value.reshape(z.shape)), density.reshape(z.shape)
