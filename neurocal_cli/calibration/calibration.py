@@ -368,8 +368,10 @@ class Calibration(Presented):
         """The camera and its poses of the named views, in pixels and world units."""
         poses, camera = [self.views[name].pose for name in names], self.camera
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        k = camera.distortion.coefficients
-        return CameraState(np.array([camera.entries]), R, t, camera.model, k, self.square_pixels)
+        lens = camera.distortion
+        return CameraState(
+            np.array([camera.entries]), R, t, lens.model, lens.coefficients, self.square_pixels
+        )
 
     @property
     def rotations(self) -> dict[str, Array]:

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import FOLDS, Quadratics, quietly
-from neurocal_cli.adjustment.normal_equations import NOTHING
+from neurocal_cli.adjustment.normal_equations import NOTHING, eliminate
 from neurocal_cli.adjustment.repeated_poses import folds_of
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.adjust import RigFit, scatter
@@ -27,9 +27,12 @@ from neurocal_cli.calibration.rig.edges import described, pair_name
 from neurocal_cli.calibration.rig.problem import ViewEquations
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_uncertainty import depth_std, fitted, has_points
+from neurocal_cli.calibration.verdict.contest import Contest
+from neurocal_cli.calibration.verdict.evidence import evidence_of
 from neurocal_cli.calibration.verdict.findings import (
     CONTRADICTION,
     ELSEWHERE,
+    LEVEL,
     SHARE,
     TOLD,
     WORDS,
@@ -39,7 +42,9 @@ from neurocal_cli.calibration.verdict.findings import (
     percent,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.rules import assess
+from neurocal_cli.calibration.verdict.rival import ABSORBED, Known, Rival, Unknowns
+from neurocal_cli.calibration.verdict.rivals import RIVALS, SHAPES
+from neurocal_cli.calibration.verdict.rules import assess, reach_verdict
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 
@@ -48,7 +53,8 @@ from neurocal_cli.camera.geometry import Array, median
 # as much as noise explains.
 _SCATTER = Limit(6.0, 12.0)
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the views
-_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[-+]?\d+)?(?: (?:%|px|mm))?")  # in a reason, with its unit
+# In a reason, with its unit, or that of which it is a part.
+_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[-+]?\d+)?(?: (?:%|px|mm|of \d+))?")
 _MOST_DIFFERENT = 2  # numbers of reasons that are told together
 
 
@@ -95,12 +101,11 @@ def _evidence(rig: Rig) -> _Evidence:
     alone = max(fit.cost - squares, NOTHING)
     cause, rest = named_cause(fit, names)
     # Frames that contradict each other have one target with an error that none of the cameras made.
-    alone_at_fault = not _SCATTER.grade(rest)
-    verdicts = {name: assess(camera, causes=alone_at_fault) for name, camera in rig.cameras.items()}
+    verdicts = _of_cameras(rig, () if _SCATTER.grade(rest) else RIVALS)
     distance, one_place = _distances(rig)
     depth, std = depth_std(fit, *(names.index(name) for name in distance[0]))
     return _Evidence(
-        cameras={name: verdict for name, verdict in verdicts.items() if verdict is not None},
+        cameras=verdicts,
         cause=cause,
         scatter=float(np.sqrt(squares / degrees)) if degrees else 0.0,
         rest=rest,
@@ -111,6 +116,45 @@ def _evidence(rig: Rig) -> _Evidence:
         depth_share=_typical(std / depth),
         one_place=one_place,
     )
+
+
+def _of_cameras(rig: Rig, rivals: tuple[Rival, ...]) -> dict[str, Verdict]:
+    """The verdicts on the cameras, in which these causes are looked for.
+
+    All see one target, so what one camera says of its shape has to be what all say.
+    """
+    seen = {name: evidence_of(camera, rivals) for name, camera in rig.cameras.items()}
+    held = [one.contest for one in seen.values() if one is not None and one.contest is not None]
+    if any(one.rival in SHAPES for each in held for one in each.causes) and not _is_of_all(held):
+        return _of_cameras(rig, tuple(one for one in rivals if one not in SHAPES))
+    found = {
+        name: assess(rig.cameras[name]) if one is None else reach_verdict(one) for name, one in seen.items()
+    }
+    return {name: verdict for name, verdict in found.items() if verdict is not None}
+
+
+def _is_of_all(cameras: Sequence[Contest]) -> bool:
+    """Whether another shape of the target is more than chance to all cameras together, each by its noise."""
+    n = sum(one.n for one in cameras)
+    for rival in SHAPES:
+        parts, absorbed = [], []
+        for one in cameras:
+            lin, steps = one.lin, rival.steps_at(one.lin)
+            f, m = len(lin.free), steps.shape[1]
+            B = np.zeros((lin.width + 1, f + m + 1))
+            B[:-1, f:-1], B[np.append(lin.free, -1), np.append(np.arange(f), -1)] = steps, 1.0
+            N = one.n / lin.cost * (B.T @ lin.R.sum(axis=0) @ B)[None]
+            parts.append(eliminate(N, np.arange(f, f + m + 1), np.arange(f))[0])
+            absorbed.append(ABSORBED * N[0].diagonal()[f:-1])
+        if len({len(one) for one in absorbed}) > 1 or not absorbed[0].size:
+            continue  # it applies to some cameras only, or to none
+        N = np.concatenate(parts)
+        its = Unknowns(rival, N[:, :-1, :-1], N[:, :-1, -1:], np.stack(absorbed))
+        together = "all", np.ones((1, len(parts))), 1.0
+        found = its.shared(Known.of(N[:, -1:, -1:].sum(axis=0), n), [together], LEVEL)
+        if any(one.evidence > LEVEL for one in found):
+            return True
+    return False
 
 
 @quietly
@@ -193,7 +237,7 @@ def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
 def told_once(texts: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], str]:
     """Each text of a camera with its name; one that several cameras have is the same for all of them.
 
-    It has the numbers of the camera whose first one is the largest, and in brackets those of the others that
+    It names those whose first number is the largest, and in brackets the others, with the numbers that
     differ.
     """
     alike: dict[str, dict[str, str]] = {}
@@ -209,9 +253,10 @@ def told_once(texts: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], str]:
             for name in names
         }
         if len(names) > 1 and max(map(len, differ.values())) <= _MOST_DIFFERENT:
-            whose = "both cameras" if len(texts) == 2 else "all cameras"
-            if len(names) < len(texts):
-                whose = f"{', '.join(names[:-1])} and {names[-1]}"
+            *most, last = (_named(name) for name, own in differ.items() if not own)
+            whose = f"{', '.join(most)} and {last}" if most else last
+            if len(most) + 1 == len(texts):
+                whose = "both cameras" if len(texts) == 2 else "all cameras"
             besides = [f"{_named(name)}: {', '.join(own)}" for name, own in differ.items() if own]
             text = f"{whose}: {several[first]}" + (f" ({'; '.join(besides)})" if besides else "")
             told |= dict.fromkeys(several.items(), text)

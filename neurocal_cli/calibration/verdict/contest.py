@@ -113,7 +113,12 @@ class Contest:
         return counted * told / _FAR_MORE if first.pattern == "all" else 0.0
 
 
-def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False) -> Contest | None:
+def contest(
+    m: Minimum,
+    image_size: tuple[int, int] | None,
+    shaped: bool = False,
+    rivals: tuple[Rival, ...] = RIVALS,
+) -> Contest | None:
     """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
 
     `shaped` tells whether the target's common shape was estimated with the camera.
@@ -128,7 +133,7 @@ def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False
         return _with_shape(lin) if shaped else lin
 
     try:
-        held = _held(at_minimum(), worth, RIVALS)
+        held = _held(at_minimum(), worth, rivals)
         if not held.causes:
             return held
         lin = at_minimum(field, another_lens)
@@ -146,7 +151,7 @@ def contest(m: Minimum, image_size: tuple[int, int] | None, shaped: bool = False
         found = [*held.causes, *estimates(beside, held.n, (NEIGHBOURS,), 0.0)[:1]]
         if not smooth or sum(max(one.evidence, 0.0) for one in found) > smooth[0].evidence + LEVEL:
             return held
-        of_all = tuple(rival for rival in RIVALS if rival.patterns is common)
+        of_all = tuple(rival for rival in rivals if rival.patterns is common)
         return _held(including(lin, smooth[0]), worth, of_all)
     except np.linalg.LinAlgError:
         return None

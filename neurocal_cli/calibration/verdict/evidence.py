@@ -58,6 +58,8 @@ from neurocal_cli.calibration.verdict.mistakes import mistake_in_all_views
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import with_rejected
 from neurocal_cli.calibration.verdict.proportions import unlike_axes
+from neurocal_cli.calibration.verdict.rival import Rival
+from neurocal_cli.calibration.verdict.rivals import RIVALS
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import (
@@ -77,9 +79,10 @@ _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plan
 _DISTANT = 10.0  # times the distance of the farthest point
 
 
-def evidence_of(calibration: Calibration) -> Evidence | None:
+def evidence_of(calibration: Calibration, rivals: tuple[Rival, ...] = RIVALS) -> Evidence | None:
     """The evidence of a calibration; None if it has no points of its own, or some are behind the camera."""
-    return None if not has_points(calibration) or views_behind(calibration) else Evidence(calibration)
+    fine = has_points(calibration) and not views_behind(calibration)
+    return Evidence(calibration, rivals) if fine else None
 
 
 def has_points(calibration: Calibration) -> bool:
@@ -105,13 +108,13 @@ def views_behind(calibration: Calibration) -> int:
 class Evidence:
     """What its points tell of a calibration, adjusted to its minimum and in normalised units.
 
-    `causes` tells whether causes of the residuals are looked for.
+    `rivals` are the causes of the residuals that are looked for.
     """
 
     # In an edited file, points may lie in the camera's plane; all measures may then be inf or nan.
     @quietly
-    def __init__(self, calibration: Calibration, causes: bool = True) -> None:
-        self.calibration, self.points, self.causes = calibration, calibration.points, causes
+    def __init__(self, calibration: Calibration, rivals: tuple[Rival, ...] = RIVALS) -> None:
+        self.calibration, self.points, self.rivals = calibration, calibration.points, rivals
         views = [calibration.views[name] for name in self.points.view_names]
         self.camera, self.given = calibration.camera, calibration.state(self.points.view_names)
         self.views = self._arranged(self.points)
@@ -270,7 +273,7 @@ class Evidence:
     def contest(self) -> Contest | None:
         """The causes of the residuals; None where a mistake explains them."""
         # Sigmas that are wrong give single points the weight that all this is computed with.
-        if not self.causes or self.stated or self.mistake or self._is_exact():
+        if not self.rivals or self.stated or self.mistake or self._is_exact():
             return None
         return self._contest_at(self.minimum)
 
@@ -279,7 +282,7 @@ class Evidence:
         target = self.calibration.target
         shaped = target is not None and (free is not None or target.bends is None)
         free = free_entries(self.calibration, NODES) if free is None else free
-        held = contest(replace(m, free=free), self.points.image_size, shaped)
+        held = contest(replace(m, free=free), self.points.image_size, shaped, self.rivals)
         if held is None:
             return None
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)

@@ -70,18 +70,15 @@ _UNCHECKED = (
 
 
 @quietly
-def assess(calibration: Calibration, causes: bool = True) -> Verdict | None:
-    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own.
-
-    `causes` tells whether causes of the residuals are looked for.
-    """
+def assess(calibration: Calibration) -> Verdict | None:
+    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own."""
     if not has_points(calibration):
         return None
     behind = views_behind(calibration)
     if behind:
         reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
         return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
-    return reach_verdict(Evidence(calibration, causes))
+    return reach_verdict(Evidence(calibration))
 
 
 def reach_verdict(evidence: Evidence) -> Verdict:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.many_cameras import errors_over_std, joined, moved, of_frames, scene, steady
+from support.many_cameras import SIGMA, errors_over_std, joined, moved, of_frames, scene, steady
 from support.rigs import all_residuals
 from support.slow_cases import slow_but
 
@@ -443,6 +443,19 @@ def test_a_lens_that_would_fold_in_the_corners_does_not_spoil_the_rig() -> None:
     assert np.sqrt((errors**2).mean()) < 1.5
 
 
+def test_a_shape_of_the_target_is_what_all_cameras_say() -> None:
+    # cam3 alone would say 0.74 % of a board that is longer by 0.3 %, and the others do not bear that out.
+    truth, _ = scene("line", 4, 24)
+    for longer, is_told in ((0.003, False), (0.006, True)):
+        points = truth.points(
+            SIGMA, np.random.default_rng(5), shape=lambda at, by=longer: at * [1 + by, 1, 1]
+        )
+        verdict = calibrate_rig(points, skew=False, target="given").verdict
+        assert verdict is not None
+        assert any("it seems longer by" in reason for reason in verdict.reasons) == is_told
+        assert (verdict.word == "good") != is_told
+
+
 def test_a_known_camera_stays_as_it_is() -> None:
     truth, points = scene("line", 3, 12)
     known = truth.cameras["cam1"]
@@ -553,6 +566,19 @@ def test_a_rig_shows_tangential_distortion_that_its_cameras_alone_do_not() -> No
     found = calibrate_rig(points, skew=False, target="given")
     assert {camera.distortion_model for camera in found.cameras.values()} == {"k1k2p1p2"}
     assert found.rmse_px < 0.145
+    errors = errors_over_std(found, rig)
+    assert np.sqrt((errors**2).mean()) < 1.3
+    assert np.abs(errors).max() < 4
+
+
+def test_a_camera_without_distortion_gets_the_tangential_one_of_a_rig() -> None:
+    rng = np.random.default_rng(0)
+    rig = random_rig("line", 4, 16, rng)
+    lens = Distortion("k1k2p1p2", np.array([0.0, 0.0, 1e-3, -1e-3]))
+    rig = replace(rig, cameras={n: replace(c, distortion=lens) for n, c in rig.cameras.items()})
+    points = rig.points(0.1, rng)
+    found = calibrate_rig(points, skew=False, target="given")
+    assert {camera.distortion_model for camera in found.cameras.values()} == {"k1k2p1p2"}
     errors = errors_over_std(found, rig)
     assert np.sqrt((errors**2).mean()) < 1.3
     assert np.abs(errors).max() < 4

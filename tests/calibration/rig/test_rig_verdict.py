@@ -220,9 +220,11 @@ def test_given_cameras_that_are_exchanged_are_named_before_what_follows_from_it(
 
 
 def test_what_several_cameras_have_is_told_once() -> None:
-    """With the largest number, and those of the others that differ."""
+    """With the largest number and its camera, and those of the others that differ."""
     one, other = "the std of the image centre is 5.1 px", "the std of the image centre is 16.4 px"
     told = told_once({"left": (one, "view01 is odd"), "right": (other, "view02 is odd")})
-    assert told["left", one] == told["right", other] == f"both cameras: {other} (left camera: 5.1 px)"
+    assert told["left", one] == told["right", other] == f"right camera: {other} (left camera: 5.1 px)"
     assert told["left", "view01 is odd"] == "left camera: view01 is odd"
     assert set(told_once({"a": (one,), "b": (one,), "c": ()}).values()) == {f"a and b: {one}"}
+    shares = {"a": ("48 of 1770 points are odd",), "b": ("63 of 1799 points are odd",)}
+    assert set(told_once(shares).values()) == {"b: 63 of 1799 points are odd (a: 48 of 1770)"}
