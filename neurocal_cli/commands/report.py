@@ -9,7 +9,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, suggest
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.writing import write_whole
 
@@ -30,8 +30,8 @@ _MOST_BYTES = 1_400_000  # of all photographs; encoded as text they take a third
     "--images",
     "DIR",
     "Show the photographs of the views, with the residuals over them: a folder or a pattern such as "
-    "'left*.png', whose files have the names of the views. For a rig give it twice, left and right, or once "
-    "for both.",
+    "'left*.png', whose files have the names of the views. For a rig give it for each camera in their order, "
+    "or once for all.",
     multiple=True,
 )
 @options.output("REPORT.html", "Write the page to this file.")
@@ -58,8 +58,6 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           | neurocal report - -o rig.html
     """  # noqa: D301 - as in the group
-    if len(images) > 2:
-        raise UsageError("--images is for one folder, or for the left and the right one of a rig")
     preparation.check((result,), (output,))
     import hashlib
 
@@ -89,15 +87,13 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     readers = {"lens": lens_from_field, "stereo": stereo_from_field, "rig": rig_from_field}
     result = readers.get(own_kind(root), calibration_from_field)(root)
     cameras, block = [result] if isinstance(result, Calibration) else [], root
-    if isinstance(result, StereoRig):
-        cameras, block = [result.left, result.right], root["left"]
-    elif isinstance(result, Rig):
-        block = root["cameras"][result.first]
+    if isinstance(result, Rig):
+        cameras = list(result.cameras.values())
+        block = root["left"] if isinstance(result, StereoRig) else root["cameras"][result.first]
     if images and not cameras:
-        what = "a rig of named cameras" if isinstance(result, Rig) else "a zoom lens"
-        raise UsageError(f"the page of {what} shows no photographs; leave out --images")
-    if len(images) > len(cameras):
-        raise UsageError("the file is of one camera; give --images once")
+        raise UsageError("the page of a zoom lens shows no photographs; leave out --images")
+    if len(images) not in (0, 1, len(cameras)):
+        raise UsageError(f"the file is of {plural(len(cameras), 'camera')}; give --images once, or for each")
     words = images * (len(cameras) if len(images) == 1 else 1)
     shown = [_photographs(*one, len(cameras)) for one in zip(cameras, words, strict=False)]
     known = "neurocal" in block and "version" in block["neurocal"]

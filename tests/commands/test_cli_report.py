@@ -126,7 +126,7 @@ def test_a_rig_has_a_page(tmp_path: Path) -> None:
     result = run("report", tmp_path / "rig.yaml")
     assert result.exit_code == 0, result.stderr
     page = Page(result.stdout)
-    for shown in ("Calibration of two cameras", "baseline", "Left camera", "Right camera", "neurocal stereo"):
+    for shown in ("Calibration of 2 cameras", "R X_left", "Camera left", "Camera right", "neurocal stereo"):
         assert shown in page.text
     assert result.stdout.count('class="heat" transform') == 2
 
@@ -225,6 +225,9 @@ def test_stereo_makes_the_page_in_the_same_run(tmp_path: Path) -> None:
     result = run("report", tmp_path / "rig.yaml", "--images", lefts, "--images", rights)
     assert result.exit_code == 0, result.stderr
     assert Page(result.stdout).tags.count("image") == left.n_views + right.n_views
+    result = run("report", tmp_path / "rig.yaml", *["--images", lefts] * 3)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "the file is of 2 cameras; give --images once, or for each" in result.stderr
 
 
 def test_fifty_views_are_less_than_3_mb(tmp_path: Path) -> None:

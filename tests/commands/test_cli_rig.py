@@ -13,6 +13,7 @@ from click.testing import Result
 from support.command_line import run
 
 from neurocal_cli import read_rig
+from neurocal_cli.commands.show.text import estimates
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = [ROOT / "sample_data" / f"rig_cam{k}.csv" for k in range(3)]
@@ -158,6 +159,8 @@ def test_the_rig_has_a_page(made: tuple[Path, Result], tmp_path: Path) -> None:
     text = (tmp_path / "page.html").read_text()
     for words in ("Calibration of 3 cameras", "Camera rig_cam2", "common frames", "relative to rig_cam0"):
         assert words in text
+    for camera in read_rig(made[0]).cameras.values():  # all parameters of all cameras
+        assert f"<td>{estimates(camera)['k1'][0]}</td>" in text
 
 
 def test_a_simulated_rig_has_the_errors_that_its_std_say(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import zip_longest
 from operator import itemgetter
 
 import numpy as np
@@ -31,7 +32,7 @@ from neurocal_cli.commands.show.html_page import (
     verdict_block,
 )
 from neurocal_cli.commands.show.plot_pages import edge_coverage, rig_in_space
-from neurocal_cli.commands.show.rig_report import camera_rows, pair_name, pose_rows, rig_rows, side_rows
+from neurocal_cli.commands.show.rig_report import camera_rows, pose_rows, side_rows
 from neurocal_cli.commands.show.text import with_std
 from neurocal_cli.commands.show.zoom_report import lens_words, network_rows
 from neurocal_cli.errors import InputError, one_line
@@ -45,12 +46,10 @@ Photographs = Sequence[Mapping[str, bytes]]  # of each camera: the images of its
 
 
 def page_of(result: Result, origin: Origin, photographs: Photographs = ()) -> str:
-    """Make the page of a result, with the photographs of a camera or of both cameras of a pair, if given."""
+    """Make the page of a result, with the photographs of a camera or of all cameras of a rig, if given."""
     if isinstance(result, Calibration):
         return _calibration_page(result, origin, photographs)
-    if isinstance(result, StereoRig):
-        return _stereo_page(result, origin, photographs)
-    return _rig_page(result, origin) if isinstance(result, Rig) else _lens_page(result, origin)
+    return _rig_page(result, origin, photographs) if isinstance(result, Rig) else _lens_page(result, origin)
 
 
 def _calibration_page(calibration: Calibration, origin: Origin, photographs: Photographs) -> str:
@@ -71,32 +70,7 @@ def _calibration_page(calibration: Calibration, origin: Origin, photographs: Pho
     return page(f"Calibration of {one_line(calibration.camera_name)}", parts)
 
 
-def _stereo_page(rig: StereoRig, origin: Origin, photographs: Photographs) -> str:
-    head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {one_line(rig.unit)}"
-    pairs = [["pair", "left rms [px]", "right rms [px]"]]
-    for a, b in rig.pairs:
-        errors = rig.left.views[a].rmse_px, rig.right.views[b].rmse_px
-        pairs.append([pair_name(a, b), *(f"{error:.4f}" for error in errors)])
-    left_out = [["pair", "reason"]]
-    left_out += [[one_line(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
-    parts = [
-        f'<p class="soft">{escape(head)}</p>',
-        verdict_block(rig.verdict),
-        section("The right camera relative to the left one", table(rig_rows(rig))),
-        section("Both cameras", table(side_rows(rig))),
-        section("Pairs", table(pairs, sortable=True)),
-        section("Pairs left out", table(left_out)),
-        _warnings(rig.warnings),
-    ]
-    sides = ("Left camera", rig.left), ("Right camera", rig.right)
-    for (side, camera), images in zip(sides, photographs or ({}, {}), strict=True):
-        parts.append(section(side, " "))
-        parts += _camera_parts(camera, images)
-    parts.append(_repeat("neurocal stereo LEFT.csv RIGHT.csv", rig.left, origin))
-    return page("Calibration of two cameras", parts)
-
-
-def _rig_page(rig: Rig, origin: Origin) -> str:
+def _rig_page(rig: Rig, origin: Origin, photographs: Photographs) -> str:
     cameras, first = list(rig.cameras), one_line(rig.first)
     head = f"{len(cameras)} cameras connected by {len(rig.frames)} frames, rms {rig.rmse_px:.4g} px"
     frames = [["frame", *(f"{one_line(name)} rms [px]" for name in cameras)]]
@@ -123,17 +97,18 @@ def _rig_page(rig: Rig, origin: Origin) -> str:
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(rig.verdict),
         section(f"The poses of the cameras, relative to {first}", "".join(map(table, pose_rows(rig)))),
-        section("The cameras", "".join(map(table, camera_rows(rig)))),
+        section("The cameras", table(camera_rows(rig)[0]), table(side_rows(rig))),
         section("The rig in space", f'<div class="figures">{space}</div>' if space else ""),
         section("Pairs of cameras", table(edges, sortable=True)),
         section("Frames", table(frames, sortable=True)),
         section("Views left out of the rig", table(left_out)),
         _warnings(rig.warnings),
     ]
-    for name, camera in rig.cameras.items():
+    for (name, camera), images in zip_longest(rig.cameras.items(), photographs):
         parts.append(section(f"Camera {one_line(name)}", " "))
-        parts += _camera_parts(camera)
-    parts.append(_repeat("neurocal rig POINTS.csv...", rig.cameras[rig.first], origin))
+        parts += _camera_parts(camera, images)
+    command = "stereo LEFT.csv RIGHT.csv" if isinstance(rig, StereoRig) else "rig POINTS.csv..."
+    parts.append(_repeat(f"neurocal {command}", rig.cameras[rig.first], origin))
     return page(f"Calibration of {len(cameras)} cameras", parts)
 
 

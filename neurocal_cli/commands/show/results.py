@@ -13,7 +13,7 @@ from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.show.camera_report import parameter_rows
 from neurocal_cli.commands.show.html_page import table, verdict_block
-from neurocal_cli.commands.show.rig_report import pose_rows, rig_rows, side_rows
+from neurocal_cli.commands.show.rig_report import pose_rows, side_rows
 from neurocal_cli.commands.show.text import Table
 from neurocal_cli.commands.show.zoom_report import draw_lens, network_rows
 from neurocal_cli.errors import InputError, UsageError, check_choice
@@ -106,11 +106,9 @@ def plot(result: Result, panel: str | None = None, kind: Literal["png", "svg", "
 
 def notebook_html(result: Calibration | Rig | ZoomLens) -> str:
     """The verdict and the parameters of a result."""
-    if isinstance(result, Calibration):
-        tables: tuple[Table, ...] = (parameter_rows(result),)
-    elif isinstance(result, StereoRig):
-        tables = side_rows(result), rig_rows(result)
+    if isinstance(result, Rig):
+        tables: tuple[Table, ...] = side_rows(result), *pose_rows(result)
     else:
-        tables = (network_rows(result),) if isinstance(result, ZoomLens) else pose_rows(result)
+        tables = (network_rows(result) if isinstance(result, ZoomLens) else parameter_rows(result),)
     head = f"<p>{escape(repr(result).splitlines()[0])}</p>"
     return "".join([head, verdict_block(result.verdict), *map(table, tables)])

@@ -185,14 +185,15 @@ def pair_name(left: str, right: str) -> str:
     return one_line(left if left == right else f"{left} / {right}")
 
 
-def side_rows(rig: StereoRig) -> Table:
-    """Both cameras' parameters side by side."""
-    rows = [["parameter", "left", "std", "right", "std"]]
-    rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
-    cells = [estimates(camera) for camera in (rig.left, rig.right)]
+def side_rows(rig: Rig) -> Table:
+    """The parameters of all cameras side by side."""
+    rows = [["parameter", *(word for name in rig.cameras for word in (one_line(name), "std"))]]
+    models = [cell for camera in rig.cameras.values() for cell in (camera.distortion_model, "")]
+    rows.append(["distortion model", *models])
+    cells = [estimates(camera) for camera in rig.cameras.values()]
     for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
-        both = [cell for own in cells for cell in own.get(name, ("", ""))]
-        rows.append([labelled(name, UNITS.get(name, "")), *both])
+        found = [cell for own in cells for cell in own.get(name, ("", ""))]
+        rows.append([labelled(name, UNITS.get(name, "")), *found])
     return rows
 
 
