@@ -44,7 +44,6 @@ from neurocal_cli.adjustment.cross_validation import (
     solve_or_nan,
 )
 from neurocal_cli.adjustment.normal_equations import Arrowhead, Covariance, unit_diagonal
-from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
@@ -192,18 +191,21 @@ def counting_views(
         into, back = told
         whole = Quadratics(into.T @ whole.S @ into, whole.g @ into, whole.cost)
         entries = back @ entries @ back.T
-    before, q = entries, _by_pose(whole, repeated)
+    before, times = entries, repeated.variance
+    weighed = q = whole.centred()  # the scores are at their own minimum, without a penalty
     if not repeated.none:  # S^-1 (sum of the variances of the poses' scores) S^-1
+        q = Quadratics(*map(repeated.summed, (whole.S, whole.g, whole.cost))).centred()
         S_inverse = inverse_or_nan(q.S.sum(axis=0))
-        entries = variance * S_inverse @ np.tensordot(repeated.variance, q.S, 1) @ S_inverse
+        entries = variance * S_inverse @ np.tensordot(times, q.S, 1) @ S_inverse
+        weighed = Quadratics(q.S / times[:, None, None], q.g / times[:, None], q.cost / times).centred()
     enough = len(q.cost) >= _FEWEST
-    contradict = enough and _contradict(q if repeated.none else _weighed(q, repeated.variance), variance)
+    contradict = enough and _contradict(weighed, variance)
     if contradict or (enough and np.isfinite(grown)):
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
             moves = moves @ back.T
         found_by_views = jackknife(q.moves_without_each() if moves is None else moves)
-        noise = _expected(q, repeated.variance, variance)
+        noise = _expected(q, times, variance)
         if contradict or _size(found_by_views, entries) > grown * _size(noise, entries):
             entries = not_smaller(entries, found_by_views)
     if entries is before or not np.isfinite(entries).all():
@@ -229,17 +231,6 @@ def _determined(S: Array) -> tuple[Array, Array] | None:
         return None
     vectors = vectors[:, kept]
     return scale[:, None] * vectors, vectors.T / scale
-
-
-def _weighed(q: Quadratics, times: Array) -> Quadratics:
-    return Quadratics(q.S / times[:, None, None], q.g / times[:, None], q.cost / times).centred()
-
-
-def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
-    """Quadratics summed over repeated views, with the scores at their own minimum (without a penalty)."""
-    if not repeated.none:
-        q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
-    return q.centred()
 
 
 def _contradict(q: Quadratics, variance: float) -> bool:

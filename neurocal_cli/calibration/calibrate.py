@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypedDict, get_args
 
 import numpy as np
 
+from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.adjustment.problem import Problem, problem_for
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, undistorted_before
@@ -332,10 +333,11 @@ def _solved(
 
         solution, rejected = with_target(problem, solution, rejected, options, choice)
         solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
-    if options.distortion == "auto":
-        from neurocal_cli.calibration.lens_choice.model_selection import with_determined_lens
+    if options.distortion == "auto" and not solution.covariance.smallest > SINGULAR:
+        from neurocal_cli.calibration.lens_choice.model_selection import select_model
 
-        solution = with_determined_lens(solution)
+        # To find outliers, the lens that follows the points best served, determined or not.
+        solution = select_model(solution, determined=True)
     if solution.state.model in WITH_XI:
         from neurocal_cli.calibration.lens_choice.xi_profile import with_all_minima
 

@@ -23,7 +23,7 @@ from neurocal_cli.adjustment.free_networks import (
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.calibration.lens_choice.model_selection import richer_lens_is_better
+from neurocal_cli.calibration.lens_choice.model_selection import with_other_lens
 from neurocal_cli.calibration.verdict.contest import contest
 from neurocal_cli.calibration.verdict.findings import DETERMINE, EXPLAINED, LEVEL
 from neurocal_cli.calibration.verdict.noise import stated_noise
@@ -48,7 +48,8 @@ def has_other_cause(
     """
     # One or two views of planes that bend and were set up by hand show distortion as another target
     # (test_cli_stereo.py).
-    if sum(problem.views.n_views for problem, _ in fits) < DETERMINE and richer_lens_is_better(found):
+    few = sum(problem.views.n_views for problem, _ in fits) < DETERMINE
+    if few and with_other_lens(found, 1, found.target.flat, found.evidence + LEVEL) is not None:
         return True
     fits = views_for_target(fits)
     # An equation of the contest, which is on the given target, may count less on the found one.

@@ -218,7 +218,7 @@ def _searched(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
     """Alternate between target and camera as `with_target` does, from the views of one solution."""
-    if not _can_tell(solution):
+    if not views_suffice([solution.problem.points], None, solution.repeated.n_groups):
         return solution, rejected
     kept = solution.noted(target_kept=choice == "auto")
     if choice == "auto" and not _tell_independently(solution):
@@ -262,11 +262,6 @@ def _settled(
         if new.distortion.model == lens:
             break
     return None if best is None else (best, rejected)
-
-
-def _can_tell(solution: Solution) -> bool:
-    """Whether there are enough independent views to estimate the target."""
-    return views_suffice([solution.problem.points], None, solution.repeated.n_groups)
 
 
 def _tell_independently(solution: Solution) -> bool:

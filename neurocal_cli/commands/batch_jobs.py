@@ -91,13 +91,16 @@ class _Maker:
 
     def job(self, sources: dict[str, str], cells: Mapping[str, tuple[str, str]]) -> Job:
         """The job of these sources of points; cells have the folders that their paths are relative to."""
+        from neurocal_cli.files.image_files import find_images
+
         kind = _kind(sources)
         first = sources.pop("images", None)
         if kind in ("calibrate", "stereo"):
             sources = {"left" if kind == "stereo" else "points": first or sources.pop("points")} | sources
         detected, measured = [], []
         for name, cell in sources.items():
-            files = self._files(cell)
+            paths = find_images([os.path.join(self._one.folder, word.strip()) for word in cell.split(";")])
+            files = [self._input(path) for path in paths]
             given = (
                 kind == "lens" or (name == "points" and first is None) or files[0].lower().endswith(".csv")
             )
@@ -118,14 +121,8 @@ class _Maker:
             steps.append(("report", result, "-o", _REPORT))
         return Job(self._one.name, kind, tuple(steps), tuple(dict.fromkeys(self._inputs)), result)
 
-    def _files(self, cell: str) -> list[str]:
-        """The files of a cell, which are inputs, relative to the folder of the results."""
-        from neurocal_cli.files.image_files import find_images
-
-        words = [os.path.join(self._one.folder, word.strip()) for word in cell.split(";")]
-        return [self._input(path) for path in find_images(words)]
-
     def _input(self, path: str) -> str:
+        """A file that is an input, relative to the folder of the results."""
         folder, file = os.path.split(path)
         name = os.path.relpath(os.path.join(os.path.realpath(folder), file), self._results)
         self._inputs.append(name)

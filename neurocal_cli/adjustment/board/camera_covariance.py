@@ -119,7 +119,11 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     variance = m.variance(n) / worth / m.repeated.worth
     if not variance > 0:
         return known
-    known = _stretched(seen, known, variance) if kept else known
+    if kept:
+        from neurocal_cli.adjustment.open_choices import open_stretch
+
+        found, stretched = open_stretch(known.found, m, seen.points.world, variance)
+        known = replace(known, found=found, stretched=stretched)
     return _chosen(seen, known, variance) if seen.choice else known
 
 
@@ -146,14 +150,6 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     found, columns = choices.opened(found, np.arange(f), m.arrow, spread, left_out)
     wide = WideCovariance(richer, m.normal, found.shared[np.ix_(columns, columns)])
     return replace(known, found=found, wide=wide)
-
-
-def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
-    """Add the uncertainty from keeping the given target."""
-    from neurocal_cli.adjustment.open_choices import open_stretch
-
-    found, probability = open_stretch(known.found, seen.minimum, seen.points.world, variance)
-    return replace(known, found=found, stretched=probability)
 
 
 def _worth(seen: CameraSeen) -> float:

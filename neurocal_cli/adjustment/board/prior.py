@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, nearest_similarity
+from neurocal_cli.camera.geometry import Array, cross_matrix, nearest_similarity
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
@@ -133,7 +133,7 @@ def _prior_of(given_bytes: bytes, plane_bytes: bytes) -> Prior:
         for name, part in _of_plane(centred @ own, is_flat(given[rows])):
             parts.append((name, _at(rows, part, n)))
         if planes > 1:
-            parts.append(("fold", _at(rows, _as_a_whole(centred / size, own), n)))
+            parts.append(("fold", _at(rows, own.T @ _rigid_motions(centred / size), n)))
     names = np.repeat([name for name, _ in parts], [part.shape[2] for _, part in parts])
     groups = {name: np.flatnonzero(names == name) for name, _ in parts}
     basis = size * np.concatenate([part for _, part in parts], axis=2)
@@ -194,11 +194,10 @@ def _of_plane(local: Array, flat: bool) -> list[tuple[str, Array]]:
     ]
 
 
-def _as_a_whole(centred: Array, axes: Array) -> Array:
-    """Shifts and rotations of a plane (n, 3, 6), along its axes."""
-    shifts = np.broadcast_to(axes.T, (len(centred), 3, 3))
-    turns = np.stack([np.cross(unit, centred) @ axes for unit in np.eye(3)], axis=2)
-    return np.concatenate([shifts, turns], axis=2)
+def _rigid_motions(centred: Array) -> Array:
+    """Shifts and rotations (n, 3, 6) of points about their middle."""
+    shifts = np.broadcast_to(np.eye(3), (len(centred), 3, 3))
+    return np.concatenate([shifts, -cross_matrix(centred)], axis=2)
 
 
 def _smooth(places: Array) -> Array:
@@ -217,9 +216,7 @@ def _smooth(places: Array) -> Array:
 def gauge_of(given: Array, plane: NDArray[np.intp], axes: Array) -> Gauge:
     """The gauge of points (n, 3) on planes (n,), along the axes of each point (n, 3, 3)."""
     centred = given - given.mean(axis=0)
-    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
-    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
-    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
+    world = np.concatenate([_rigid_motions(centred), centred[..., None]], axis=2)
     along = np.swapaxes(axes, 1, 2)
     directions = np.linalg.qr((along @ world).reshape(3 * len(given), 7))[0]
     if not plane.any():

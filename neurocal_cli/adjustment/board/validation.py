@@ -40,13 +40,12 @@ from neurocal_cli.adjustment.board.system import (
     points_first,
     with_single_points,
 )
-from neurocal_cli.adjustment.cross_validation import least_by_precision
+from neurocal_cli.adjustment.cross_validation import FOLDS, least_by_precision
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.camera.geometry import Array
 
 _LEAST, _MOST = 1e-6, 1.0  # range of the search, over the target's size, if all errors were noise
 _GRID, _FINER = 12, (0.6, 0.3, 0.1)  # grid points, then half-widths of parabolic steps; in the logarithm
-_FOLDS = 5
 _FAR = 6.0  # largest bend of a view over the rms of the other views
 _COMMON = 30.0  # largest common part over the mean square of the rest: exceeded in one random set of 200
 
@@ -107,7 +106,7 @@ def bends_are_valid(sight: Sight, bends: Array, precision: float) -> bool:
     if not _consistent(bends):
         return False
     ratio = 0.0  # log ratio, so that a fold whose camera comes from few views does not outweigh the others
-    n_folds = min(sight.views.n_views, _FOLDS)
+    n_folds = min(sight.views.n_views, FOLDS)
     halves = [without_points(sight.of_points(sight.views.rank % 2 == half)) for half in (0, 1)]
     whole = halves[0] + halves[1]
     for fold in range(n_folds):
@@ -146,12 +145,11 @@ def _lost(others: Information, halves: list[Information], precision: float | Non
 
 
 _FEWEST = 4  # fewest views, so that the others determine a camera
-_N_FOLDS = 5
 
 
 def folds_of(n_views: Sequence[int]) -> list[NDArray[np.intp]]:
     """The fold of each view (V,) of each camera; a single one if there are too few views for a test."""
-    n_folds = min(max(n_views), _N_FOLDS) if sum(n_views) >= _FEWEST else 1
+    n_folds = min(max(n_views), FOLDS) if sum(n_views) >= _FEWEST else 1
     return [np.arange(n) % n_folds for n in n_views]
 
 

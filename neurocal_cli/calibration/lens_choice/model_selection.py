@@ -25,7 +25,6 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.find import Found, find_target
 from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
-from neurocal_cli.adjustment.observability import SINGULAR
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
@@ -98,17 +97,6 @@ def select_model(
         adjusted=replace(chosen.adjusted, iterations=iterations),
         model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
     )
-
-
-def with_determined_lens(solution: Solution) -> Solution:
-    """Select again among the models whose coefficients the points determine, if they do not for this one.
-
-    It is asked once points are left out: to find outliers, the lens that follows the points best serves,
-    determined or not.
-    """
-    if solution.covariance.smallest > SINGULAR:
-        return solution
-    return select_model(solution, determined=True)
 
 
 def _with_other_starts(
@@ -257,15 +245,15 @@ def find_lens_and_target(
         return None
     for step, least in ((1, LEVEL), (-1, _SIMPLER)):
         moved = False
-        while (other := _with_other_lens(best, step, flat, best.evidence + least)) is not None:
+        while (other := with_other_lens(best, step, flat, best.evidence + least)) is not None:
             best, moved = other, True
         if moved:
             break
     return best
 
 
-def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found | None:
-    """Estimate the target with every camera's next distortion model.
+def with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found | None:
+    """Estimate the target with every camera's next distortion model, by a step of 1 or -1 coefficients.
 
     None at the end of the chain, or if the log evidence is not larger than `least`.
     """
@@ -277,8 +265,3 @@ def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found
         other = problem.with_model(POLYNOMIAL_MODELS[place])
         fits.append((other, other.adjust(adjusted.state.with_model(POLYNOMIAL_MODELS[place]))))
     return find_target(fits, flat, found.target, least=least)
-
-
-def richer_lens_is_better(found: Found) -> bool:
-    """Whether one more distortion coefficient, with another target, explains the data decidedly better."""
-    return _with_other_lens(found, 1, found.target.flat, found.evidence + LEVEL) is not None

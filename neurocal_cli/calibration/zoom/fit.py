@@ -140,7 +140,9 @@ def fit_lens(
         start = choose_model(lens, options)
     else:
         start = calibrate_settings(lens, distortion, options)
-    start, joints = _train_and_reject(start, options)
+    joints = _trained(start, options)
+    while options.reject and (rest := _without_odd(start, joints, options)) is not None:
+        start, joints = rest, _trained(rest, options)
     fitted = assemble(start, joints, options)
     if found is None:
         return fitted
@@ -148,16 +150,6 @@ def fit_lens(
     with suppress(np.linalg.LinAlgError):  # an undetermined pose
         coupling = target_coupling(start.data, start.tables, found, start.variance)
     return replace(fitted, target=found, target_coupling=coupling)
-
-
-def _train_and_reject(
-    start: CalibratedSettings, options: FitOptions
-) -> tuple[CalibratedSettings, list[Joint]]:
-    """Steps 2 and 3, with rejection of settings that contradict all others."""
-    joints = _trained(start, options)
-    while options.reject and (rest := _without_odd(start, joints, options)) is not None:
-        start, joints = rest, _trained(rest, options)
-    return start, joints
 
 
 def _without_odd(

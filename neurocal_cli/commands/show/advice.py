@@ -15,7 +15,7 @@ from neurocal_cli.calibration.rig.advice import RigAdvice
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.camera_panels import outline_of
+from neurocal_cli.commands.show.camera_panels import CORNERS, outline_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, drawing, panels_in_rows, plain, style
 from neurocal_cli.commands.show.text import Report, attributes
 from neurocal_cli.errors import one_line
@@ -27,7 +27,6 @@ _ACROSS = ("far left", "left", "middle", "right", "far right")
 _DOWN = ("very top", "top", "middle", "bottom", "very bottom")
 _SIDES = ("right", "lower right", "lower", "lower left", "left", "upper left", "upper", "upper right")
 _MOST_DOTS = 4000
-_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])  # of a square
 _HALF = {"h": (0.5, 0.0), "v": (0.0, 0.5)}  # from a vertex to the mid-point of an edge [squares]
 _PIECES = 12  # of each side of an outline
 
@@ -165,8 +164,8 @@ def board_of(calibration: Calibration) -> tuple[Array, Array]:
     to_world = np.linalg.lstsq(grid, world, rcond=None)[0]  # the plane of a board that is bent
     columns, rows = grid[:, :2].max(axis=0).astype(int) + 1
     dark = [(c, r) for c in range(-1, columns) for r in range(-1, rows) if (c + r) % 2 == 0]
-    rim = _CORNERS * (columns + 1, rows + 1) - 1
-    squares = np.array(dark)[:, None] + _CORNERS
+    rim = CORNERS * (columns + 1, rows + 1) - 1
+    squares = np.array(dark)[:, None] + CORNERS
     return np.insert(squares, 2, 1, axis=2) @ to_world, _closed(np.insert(rim, 2, 1, axis=1) @ to_world)
 
 

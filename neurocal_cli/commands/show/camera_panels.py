@@ -34,14 +34,17 @@ _MOST_BARS = 40  # greatest number of views with room for their names
 _ACROSS = 24  # letters of names that have room beside each other
 _LONGEST_ARROW = 0.04  # greatest length of an rms arrow, as a share of the image width
 _ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
-_CELLS = 6  # across and down, as in the verdict
+CELLS = 6
+"""Parts of an image across and down, as in the verdict."""
 _MOST_DOTS = 5000
 _LEVELS = 12  # of uncertainty
 _FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
 _MOST_NAMES = 24  # of views in space
-_SIZE = 0.12  # of a drawn camera, relative to the scene
+SIZE = 0.12
+"""Of a drawn camera, relative to the scene."""
 _LINES = 4  # of names below each other
-_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+"""Of a square."""
 _HERE = Pose(np.eye(3), np.zeros(3))
 _LONGEST = 0.12  # of a target's plane, for the longest arrow
 _HEIGHT_LEVELS = 13
@@ -177,7 +180,7 @@ def draw_coverage(axes: Axes, subject: Subject) -> None:
     """Draw the number of points in each part of the image; parts without points are marked."""
     left, right, top, bottom = set_image(axes, subject)
     u, v = subject.points.pixels.T
-    across, down = np.linspace(left, right, _CELLS + 1), np.linspace(top, bottom, _CELLS + 1)
+    across, down = np.linspace(left, right, CELLS + 1), np.linspace(top, bottom, CELLS + 1)
     counts = np.histogram2d(v, u, (down, across))[0]
     drawn = axes.pcolormesh(across, down, counts, cmap="Blues", vmin=0, vmax=max(1.0, 1.3 * counts.max()))
     colour_bar(axes, drawn, "points")
@@ -268,7 +271,7 @@ def draw_poses(
         if label := names_of_views.get(name):
             outermost = outline[np.linalg.norm((outline - middle)[:, :2], axis=1).argmax()]
             space.text(*_turned(outermost[None])[0], label, fontsize=8, color=INK, fontweight="bold")
-    size = _SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
+    size = SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
     for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):
         corners = (frustum(camera, size) - pose.t) @ pose.R
         extent.append(corners)
@@ -323,7 +326,7 @@ def outline_of(world: Array) -> Array:
 def frustum(camera: Camera, size: float) -> Array:
     """Centre and corners of a camera's frustum in its own frame."""
     width, height = camera.image_size or (2 * camera.intrinsics.u0, 2 * camera.intrinsics.v0)
-    pixels = np.column_stack([_CORNERS * (width, height), np.ones(4)])
+    pixels = np.column_stack([CORNERS * (width, height), np.ones(4)])
     rays = pixels @ np.linalg.inv(camera.intrinsics.A).T
     return np.vstack([np.zeros(3), size * rays])
 

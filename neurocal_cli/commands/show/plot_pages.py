@@ -13,6 +13,8 @@ from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.commands.show.camera_panels import (
+    CELLS,
+    SIZE,
     Outline,
     Subject,
     draw_poses,
@@ -26,9 +28,7 @@ from neurocal_cli.errors import plural
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_CELLS = 6  # across and down, as in the verdict
 _MOST_NUMBERS = 14  # cameras with room for a number in each cell
-_SIZE = 0.12  # of a drawn camera, relative to the scene
 _LABEL = (190.0, 24.0)  # room of a camera's name in the drawing
 # The direction of the view of the drawing: from above, and from the right.
 _VIEW = euler_to_rotation(np.radians(22.0), 0.0, 0.0) @ euler_to_rotation(0.0, np.radians(30.0), 0.0)
@@ -53,13 +53,13 @@ def edge_coverage(rig: Rig) -> tuple[Array, Array]:
         if not len(camera.points):
             continue
         size = np.array(camera.image_size or np.ceil(camera.points.pixels.max(axis=0)) + 1)
-        cells = np.clip((camera.points.pixels + 0.5) * _CELLS / size, 0, _CELLS - 1).astype(np.intp)
-        cell = _CELLS * cells[:, 1] + cells[:, 0]
+        cells = np.clip((camera.points.pixels + 0.5) * CELLS / size, 0, CELLS - 1).astype(np.intp)
+        cell = CELLS * cells[:, 1] + cells[:, 0]
         for b, other in enumerate(names):
             both = {views[name] for views in rig.frames.values() if {name, other} <= set(views)}
             seen = np.array([view in both or a == b for view in camera.points.view_names])
             frames[a, b] = seen.sum()
-            covered[a, b] = len(np.unique(cell[seen[camera.points.view_index]])) / _CELLS**2
+            covered[a, b] = len(np.unique(cell[seen[camera.points.view_index]])) / CELLS**2
     return frames, covered
 
 
@@ -98,7 +98,7 @@ def rig_in_space(rig: Rig) -> str:
     if not targets:
         return ""
     everything = np.vstack([outline for _, outline, _, _ in targets])
-    size = _SIZE * float(np.linalg.norm(np.ptp(everything, axis=0)))
+    size = SIZE * float(np.linalg.norm(np.ptp(everything, axis=0)))
     cameras = [
         (name, (frustum(camera.camera, size) - rig.poses[name].t) @ rig.poses[name].R)
         for name, camera in rig.cameras.items()
