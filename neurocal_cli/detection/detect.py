@@ -137,8 +137,10 @@ def detect_points(
         image, gamma = negative(image if gamma is None else linearised(image, gamma)), None
     identified = _identified(image, board, grids)
     measured = _all_measured(image, identified.located, points, gamma)
-    every = [one.vertex_ids() if points == "vertices" else one.midpoint_ids() for one in board.planes]
-    fewest = min(_FEWEST, sum(map(len, every)))
+    every = (
+        one.cols * one.rows if points == "vertices" else len(one.midpoint_grid()) for one in board.planes
+    )
+    fewest = min(_FEWEST, sum(every))
     if (_count(measured) < fewest or any(one.rejected for one in measured)) and is_drawn(image):
         # Edges that are drawn in whole pixels lack the blur which tells their places.
         soft = blurred(image)

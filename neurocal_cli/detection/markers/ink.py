@@ -134,6 +134,7 @@ class InkedPixels:
     shown: NDArray[np.bool_]  # which of the cells these are
     pixels: Array  # (N, M, 2), padded
     used: NDArray[np.bool_]  # (N, M) False for the padding
+    place: NDArray[np.intp]  # of the used ones in the flat image
 
     @classmethod
     def of(cls, raw: GridImage, ink: Ink, look: Appearance) -> InkedPixels:
@@ -145,8 +146,8 @@ class InkedPixels:
         if ink.border * look.clearance(ink) > _REACH:
             ink = ink.filled
         corners, sigma = look.map.at(ink.cell[:, None] + _CORNERS), _WIDER * look.blur[:, :2].max(axis=1)
-        pixels, used = _near_edges(result, ink, corners, sigma, len(ink.lines) == 2)
-        return cls(replace(raw, image=result), ink, shown, pixels, used)
+        near = _near_edges(result, ink, corners, sigma, len(ink.lines) == 2)
+        return cls(replace(raw, image=result), ink, shown, *near)
 
     def under(self, look: Appearance, most: float) -> GridImage:
         """The image with what patterns add to its light, and NaN where they change it by more than `most`.
@@ -160,53 +161,50 @@ class InkedPixels:
             a, b, *slopes = inverse.at(inverse.from_centre(self.pixels))
             blurred = _Blurred.of(slopes, look.blur[self.shown], look.shift, look.tails)
             change = blurred.pattern(a, b, self.ink.lines, self.ink.inner)[self.used]
-            u, v = self.pixels[self.used].T.astype(np.intp)
-            place = v * self.raw.size[0] + u
-            np.add.at(light.reshape(-1), place, change)  # some pixels are near the edges of two cells
-            result.reshape(-1)[place[np.abs(change) > most]] = np.nan
+            np.add.at(light.reshape(-1), self.place, change)  # some pixels are near the edges of two cells
+            result.reshape(-1)[self.place[np.abs(change) > most]] = np.nan
         return replace(self.raw, image=result, ink=light)
 
 
 def _near_edges(
     result: NDArray[np.float32], ink: Ink, corners: Array, sigma: Array, filled: bool
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.intp]]:
     """Pixels (N, M, 2) near the edges of cells that their patterns reach, padded, and a mask (N, M) of them.
 
-    Other pixels within a pattern, which are too far from the edges for the fits, become NaN in the image.
+    Also their places in the flat image. Other pixels within a pattern, which are too far from the edges for
+    the fits, become NaN in the image.
     """
     height, width = result.shape
-    parts = []
+    sides = corners[:, [1, 3]] - corners[:, :1]
+    apart = np.abs(np.linalg.det(sides))[:, None] / np.hypot(*np.moveaxis(sides, 2, 0))[:, ::-1]
+    room = _REACH * sigma + _SLACK
+    low = np.maximum(np.floor(corners.min(axis=1) - room[:, None]), 0).astype(int)
+    high = np.minimum(np.ceil(corners.max(axis=1) + room[:, None]) + 1, [width, height]).astype(int)
+    changed = np.stack([ink.inner.any(axis=axis) for axis in (1, 2)], axis=1)
+    first, last = changed.argmax(axis=2), changed.shape[2] - changed[:, :, ::-1].argmax(axis=2)
+    middle, half = 0.5 * (ink.lines[last] + ink.lines[first]), 0.5 * (ink.lines[last] - ink.lines[first])
     to_cells = homographies(corners, np.broadcast_to(_CORNERS, corners.shape))
-    for H, box, inner, s in zip(to_cells, corners, ink.inner, sigma.tolist(), strict=True):
-        room = _REACH * s + _SLACK
-        low = np.maximum(np.floor(box.min(axis=0) - room), 0).astype(int)
-        high = np.minimum(np.ceil(box.max(axis=0) + room) + 1, [width, height]).astype(int)
-        if (high <= low).any():
-            parts.append(np.zeros((0, 2), dtype=np.intp))
-            continue
-        u, v = np.arange(low[0], high[0], dtype=np.float32), np.arange(low[1], high[1], dtype=np.float32)
-        a, b, w = (float(x) * u + float(y) * v[:, None] + float(one) for x, y, one in H)
+    parts = []
+    for k, ((left, top), (right, bottom)) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+        u, v = np.arange(left, right, dtype=np.float32), np.arange(top, bottom, dtype=np.float32)
+        a, b, w = (x * u + (y * v + one)[:, None] for x, y, one in to_cells[k].tolist())
         a, b = a / w, b / w
-        side_a, side_b = np.hypot(*(box[1] - box[0])), np.hypot(*(box[3] - box[0]))
-        # Distances between opposite sides.
-        slant = abs(float(np.linalg.det(np.stack([box[1] - box[0], box[3] - box[0]])))) / (side_a * side_b)
-        side_a, side_b = side_a * slant, side_b * slant
-        columns, rows = (np.flatnonzero(inner.any(axis=axis)) for axis in (0, 1))
-        inward = np.minimum(side_a * np.minimum(a, 1 - a), side_b * np.minimum(b, 1 - b))
-        beyond_a = np.maximum(ink.lines[columns[0]] - a, a - ink.lines[columns[-1] + 1])
-        beyond_b = np.maximum(ink.lines[rows[0]] - b, b - ink.lines[rows[-1] + 1])
-        outward = np.maximum(side_a * beyond_a, side_b * beyond_b)
-        reached = outward < room
-        near = reached & (inward < _FITTED * s + _FITTED_PX)
+        (side_a, side_b), (at_a, at_b), (half_a, half_b) = (x[k].tolist() for x in (apart, middle, half))
+        inward = np.minimum(side_a * (0.5 - np.abs(a - 0.5)), side_b * (0.5 - np.abs(b - 0.5)))
+        outward = np.maximum(side_a * (np.abs(a - at_a) - half_a), side_b * (np.abs(b - at_b) - half_b))
+        reached = outward < float(room[k])
+        near = reached & (inward < _FITTED * float(sigma[k]) + _FITTED_PX)
         if filled:
             near &= outward > -_SLACK  # pixels within the border change too much
-        result[low[1] : high[1], low[0] : high[0]][reached & ~near] = np.nan
-        parts.append(np.argwhere(near)[:, ::-1] + low)
+        result[top:bottom, left:right][reached & ~near] = np.nan
+        v, u = np.nonzero(near)
+        parts.append((v + top) * width + (u + left))
     count = np.array([len(part) for part in parts])
     used = np.arange(max(int(count.max(initial=1)), 1)) < count[:, None]
+    place = np.concatenate(parts) if parts else np.zeros(0, dtype=np.intp)
     pixels = np.repeat(corners.mean(axis=1)[:, None], used.shape[1], axis=1)
-    pixels[used] = np.concatenate(parts)
-    return pixels, used
+    pixels[used] = np.stack(np.divmod(place, width)[::-1], axis=-1)
+    return pixels, used, place
 
 
 @frozen_dataclass(eq=False)

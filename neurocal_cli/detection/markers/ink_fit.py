@@ -66,9 +66,10 @@ _ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
 def fit_with_ink(raw: GridImage, ink: Ink, undo: bool = True) -> GridFit:
     """Fit a board whose cells have patterns, after sharpening by the camera is undone if `undo`."""
     ink = ink.beside(raw.grid.seen)
-    look, mapped, levels, noise, shading = _first_look(raw, ink)
+    gaps = _gaps(raw, ink)
+    look, mapped, levels, noise, shading = _first_look(raw, ink, gaps)
     sigma = upper_median(look.blur[:, 0])
-    profile = _plain_profile(raw, mapped, _gaps(raw, ink), sigma, *levels) if undo else None
+    profile = _plain_profile(raw, mapped, gaps, sigma, *levels) if undo else None
     sharpening = find_sharpening(profile)
     if sharpening is not None:
         return fit_with_ink(sharpening.undone(raw, 2 * raw.grid.square), ink, undo=False)
@@ -92,14 +93,15 @@ def _look_of(fitted: GridFit, ink: Ink) -> Appearance:
     return Appearance(at, spread, float(fitted.map.shift[0]), fitted.fit.shape.tails.mean(axis=0))
 
 
-def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Array, Array], float, Shading]:
+def _first_look(
+    raw: GridImage, ink: Ink, gaps: tuple[Array, Array, float]
+) -> tuple[Appearance, MapFit, tuple[Array, Array], float, Shading]:
     """How the board looks by the found vertices and by profiles across the edges between them.
 
     Returns also the map of the edges, their mean levels and half contrasts, noise [DN^2], and shading.
     """
     found = map_of_vertices(raw)
     noise = _noise(raw, found.map)
-    gaps = _gaps(raw, ink)
     sigmas, offsets = _SIGMAS, _OFFSETS
     for _ in range(2):
         lines = raw.edges.lines(found.map)
@@ -210,16 +212,17 @@ def _profiles(
     level = seen.mean(axis=1)
     moved, profile = (x.astype(np.float32) for x in (d - offsets[:, None, None], seen - level[:, None]))
     sign, room = (x.astype(np.float32)[:, None] for x in (side, gap))
-    tried = []
-    for sigma in sigmas.tolist():
-        x = erf_and_density(moved / sigma)[0]
-        x -= sign * near[:, None] * (1 + erf_and_density((sign * moved - room) / sigma)[0])
-        # The line through the profile over x.
-        sum_x, product_x, squares = (one.sum(axis=2, dtype=float) for one in (x, x * profile, x * x))
-        contrast = _PLACES * product_x / np.maximum(_PLACES * squares - sum_x**2, _TINY)
-        cost = np.where(contrast > 0, -contrast * product_x, np.inf)
-        tried.append((cost, level - contrast * sum_x / _PLACES, contrast))
-    costs, means, contrasts = (np.stack(one) for one in zip(*tried, strict=True))
+    per_sigma = (1 / sigmas).astype(np.float32)[:, None, None, None]
+    x = erf_and_density(moved * per_sigma)[0]
+    x -= sign * near[:, None] * (1 + erf_and_density((sign * moved - room) * per_sigma)[0])
+    # The line through the profile over x.
+    sum_x, product_x, squares = (
+        np.einsum(f"soen{of}->soe", x, *other, dtype=float)
+        for of, other in (("", ()), (",en", (profile,)), (",soen", (x,)))
+    )
+    contrasts = _PLACES * product_x / np.maximum(_PLACES * squares - sum_x**2, _TINY)
+    costs = np.where(contrasts > 0, -contrasts * product_x, np.inf)
+    means = level - contrasts * sum_x / _PLACES
     every = np.arange(len(d))
     k, j = np.divmod(costs.reshape(-1, len(d)).argmin(axis=0), len(offsets))
     # The least of the parabola through the costs of three offsets.
@@ -269,18 +272,13 @@ def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array, float]:
 
     Also that of codes within dark cells.
     """
-    edges = raw.edges
-    patterned = {tuple(cell): k for k, cell in enumerate(ink.cell.tolist())}
+    edges, cells = raw.edges, ink.cell
+    unlike = ink.light != ink.base[:, None, None]
+    bordered = unlike[:, 0].all(axis=1), unlike[:, :, 0].all(axis=1)
     gap, sign = np.ones(len(edges.index)), np.ones(len(edges.index))
-    for e, ((c, r), vertical, light) in enumerate(
-        zip(edges.index.tolist(), edges.vertical, edges.light, strict=True)
-    ):
-        for after in (0, 1):
-            cell = (c - 1 + after, r) if vertical else (c, r - 1 + after)
-            if cell in patterned:
-                k = patterned[cell]
-                ring = ink.light[k][:, 0] if vertical else ink.light[k][0]
-                if (ring != ink.base[k]).all():
-                    gap[e] = ink.lines[0]
-                    sign[e] = light * (1 if after else -1)
+    for after in (0, 1):
+        beside = edges.index - (1 - after) * np.where(edges.vertical[:, None], [1, 0], [0, 1])
+        e, k = np.nonzero((beside[:, None] == cells).all(axis=2))
+        e = e[np.where(edges.vertical[e], bordered[1][k], bordered[0][k])]
+        gap[e], sign[e] = ink.lines[0], edges.light[e] * (1 if after else -1)
     return gap, sign, ink.gap if (ink.base < 0).all() else np.inf
