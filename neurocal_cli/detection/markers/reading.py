@@ -85,11 +85,10 @@ def candidates(look: Sequence[View]) -> Array:
         parameters = detector.getDetectorParameters()
         parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(view.scale, 1.0) / max(view.image.shape)
         detector.setDetectorParameters(parameters)
-        read, _, others = detector.detectMarkers(view.image)
-        for corners in (read, others):
-            # OpenCV's corners lie on the centres of the outermost dark pixels.
-            pixels = (np.array(corners, dtype=float).reshape(-1, 4, 2) + 0.5) / view.scale - 0.5
-            found.append(pixels + np.array(view.origin))
+        corners = detector.detectMarkers(view.image)[2]
+        # OpenCV's corners lie on the centres of the outermost dark pixels.
+        pixels = (np.array(corners, dtype=float).reshape(-1, 4, 2) + 0.5) / view.scale - 0.5
+        found.append(pixels + np.array(view.origin))
     return np.concatenate(found)
 
 
@@ -141,6 +140,7 @@ def _detector():  # type: ignore[no-untyped-def]
     # A marker is not left out because the square around it looks like one, too.
     parameters.minMarkerDistanceRate = _APART
     parameters.polygonalApproxAccuracyRate = 0.06  # more than by default, which helps with small markers
+    parameters.minOtsuStdDev = 256.0  # no light in a quadrangle varies so much, so that no code is read
     return aruco.ArucoDetector(aruco.Dictionary(family.bytesList[:1], 4, 0), parameters)
 
 
