@@ -131,7 +131,7 @@ def _around(outline: Array, reach: float, most: int) -> tuple[Array, NDArray[np.
     thickness = 2 * int(np.ceil(_ROUGHLY * reach + sagitta)) + 3
     for mask, line in zip(along, np.rint(outline - low[:, None]).astype(np.int32), strict=True):
         cv2.polylines(mask, [line], True, 1, thickness)
-    near = (away < (high - low)[:, None]).all(axis=2) & (along.reshape(len(low), -1) > 0)
+    near = along.reshape(len(low), -1) > 0
     stride = max(1, np.count_nonzero(near) // (most * len(low)))
     index, used = packed(near)
     return low[:, None] + away[index[:, ::stride] % len(away)], used[:, ::stride]
@@ -154,10 +154,10 @@ def _distances(
     def nearer(foot: Single, point: Single) -> tuple[Single, Single, Single]:
         """Distance from the outline, normal at a foot near it, and the radius there."""
         a, b, au, av, bu, bv = inverse.at(foot)
-        rho = np.maximum(np.hypot(a, b), _TINY)
-        slope = np.stack([a * au + b * bu, a * av + b * bv], axis=1)
-        steep = np.maximum(np.hypot(slope[:, 0], slope[:, 1]), _TINY)
-        n = slope / steep[:, None]
+        rho = np.maximum(np.sqrt(a * a + b * b), _TINY)  # faster than `numpy.hypot`
+        n = np.stack([a * au + b * bu, a * av + b * bv], axis=1)
+        steep = np.maximum(np.sqrt((n * n).sum(axis=1)), _TINY)
+        n /= steep[:, None]
         return ((point - foot) * n).sum(axis=1) + (rho - radius) * rho / steep, n, rho
 
     d, n, rho = nearer(point, point)
@@ -174,18 +174,18 @@ def _distances(
     M = inverse.at(centre)[2:].swapaxes(0, 1).reshape(-1, 2, 2)
     G = M.swapaxes(1, 2) @ M / radius**2
     gradient = G @ (foot - centre)
-    length = np.maximum(np.hypot(gradient[:, 0], gradient[:, 1]), _TINY)
+    length = np.maximum(np.sqrt((gradient * gradient).sum(axis=1)), _TINY)
     tangent = np.stack([-gradient[:, 1], gradient[:, 0]], axis=1) / length[:, None]
     curvature = ((G @ tangent) * tangent).sum(axis=1) / length
     return point, d, n, 0.5 * np.clip(curvature, 0, 2), rho, used
 
 
 _AROUND = 3  # found circles around one that was not recognised
-_ROUNDS, _MOST_ROUNDS = 3, 8
+_MOST_ROUNDS = 8
 _SETTLED = (
     0.5  # standard deviations of a centre, rms movement of the map after which no other round is needed
 )
-_FEW = 1000  # pixels of a circle, enough for the first rounds
+_FEW = 250, 1000  # pixels of a circle, enough for the first rounds
 _STEPS = 8  # Gauss-Newton steps
 _FIRST_BLUR = 1.2  # px
 _LOOSE = 0.3  # relative prior standard deviation of levels and blur
@@ -211,9 +211,9 @@ def measure_circles(
     places = plane.spread(index.astype(float))
     apart = np.sqrt(2) if plane.asymmetric else 1.0
     blur, shading, some = _FIRST_BLUR, None, np.ones(len(places), dtype=np.bool_)
-    for done in range(1, _MOST_ROUNDS + 1):
-        band = _band(light, found.map, places, radius, _ROOM * apart)
-        most = _FEW if done < _ROUNDS else light.size
+    band = _band(light, found.map, places, radius, _ROOM * apart)
+    for done in range(_MOST_ROUNDS):
+        most = _FEW[done] if done < len(_FEW) else light.size
         pixels = outline_pixels(light, found.map, places, radius, blur, band, shading, most)
         fit = _fitted(pixels, blur, floor, shading is not None and shading.has_borders)
         sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
@@ -233,7 +233,7 @@ def measure_circles(
         blur = upper_median(fit.values[some, BLUR])
         radius *= 1 + upper_median(fit.values[some, 2]) / _pixel_radius(found.map, places, radius)
         shading = board_shading(fit, found.map.at(places), some, found.map)
-        if done >= _ROUNDS and moved < _SETTLED * np.sqrt(upper_median(fit.covariance[some, 0, 0])):
+        if done >= len(_FEW) and moved < _SETTLED * np.sqrt(upper_median(fit.covariance[some, 0, 0])):
             break
     uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
     spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None] + uneven * np.eye(2)
@@ -353,14 +353,17 @@ def circle_model(data: CirclePixels, values: Array, shape: ProfileShape) -> Line
     x, slope, _ = profile(z, shape.tails)
     gain = data.gain * data.root
     rows = rows_for(len(z), 6, z.shape[1], x.dtype)
-    steep = slope * gain * (contrast / sigma)
-    rows[:, 0] = (data.value - mean) * data.root - contrast * x * gain
-    rows[:, 1] = -steep * data.u
-    rows[:, 2] = -steep * data.v
-    rows[:, 3] = -steep
-    rows[:, 4] = data.root
-    rows[:, 5] = x * gain
-    rows[:, 6] = -steep * (z - 2 * data.bend * sigma)
+    residual, by_u, by_v, by_growth, by_mean, by_contrast, by_blur = rows.swapaxes(0, 1)[:7]
+    np.multiply(x, gain, out=by_contrast)
+    np.subtract(data.value, mean, out=residual)
+    residual *= data.root
+    residual -= contrast * by_contrast
+    slope *= gain
+    np.multiply(slope, -contrast / sigma, out=by_growth)
+    np.multiply(by_growth, data.u, out=by_u)
+    np.multiply(by_growth, data.v, out=by_v)
+    by_mean[...] = data.root
+    np.multiply(by_growth, z - 2 * data.bend * sigma, out=by_blur)
     return Linearised(rows, z, x)
 
 
