@@ -86,8 +86,8 @@ def _all_ellipses(grey: NDArray[np.uint8], parts: list[tuple[slice, slice]]) -> 
             window = 2 * round(0.5 * share * max(grey.shape)) + 3
             mean = cv2.blur(part, (window, window))
             for step in _STEPS:
-                dark = cv2.compare(part, cv2.subtract(mean, float(step)), cv2.CMP_LT)
-                outlines += _outlines(np.asarray(dark, dtype=np.uint8), (u.start, v.start))
+                level = np.maximum(mean, step) - np.uint8(step)
+                outlines += _outlines(part < level, (u.start, v.start))
     return _ellipses(outlines, smooth)
 
 
@@ -112,12 +112,12 @@ def _distinct(looks: list[Array]) -> Blobs:
     return Blobs(every[kept, 1:3], every[kept, 0])
 
 
-def _outlines(dark: NDArray[np.uint8], origin: tuple[int, int] = (0, 0)) -> list[NDArray[Any]]:
+def _outlines(dark: NDArray[np.bool_], origin: tuple[int, int] = (0, 0)) -> list[NDArray[Any]]:
     """Outlines (P, 2) of what may be ellipses in a mask, whose first pixel is at `origin`.
 
     They enclose as much as that of a thin ellipse; the others are long, and many.
     """
-    every, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=origin)
+    every, _ = cv2.findContours(dark.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=origin)
     return [
         np.asarray(x)[:, 0]
         for x in every

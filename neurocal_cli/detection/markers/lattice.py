@@ -81,8 +81,8 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
             best = Placed(some.only(kept), how, cells, at[kept], ground[kept], some)
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
-        if len(kept) == len(some) and isinstance(plane, TagPlane):
-            break  # codes that are turned agree with no others
+        if 2 * len(kept) > len(some) and isinstance(plane, TagPlane):
+            break  # a tag agrees with others in one turn only
     return best
 
 
