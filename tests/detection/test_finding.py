@@ -245,6 +245,13 @@ def test_visible_vertices_of_partly_hidden_boards_are_found(name: str, count: in
     assert found >= 0.99 * total
 
 
+def test_a_board_that_is_linked_with_the_one_behind_it_is_found_whole() -> None:
+    """Both are one lattice at first, which falls apart once it has grown."""
+    shot = picture("two boards", FIRST + 10)
+    sizes = [sorted(grid.shape) for grid in find_grids(shot.image) if grid.seen.all()]
+    assert sizes == [[5, 6]]
+
+
 @pytest.mark.parametrize("count", [3, pytest.param(30, marks=pytest.mark.slow)])
 def test_there_is_no_grid_in_clutter(count: int) -> None:
     found = [bool(find_grids(picture("clutter only", FIRST + k).image)) for k in range(count)]

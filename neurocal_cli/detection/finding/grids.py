@@ -85,7 +85,7 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
             lattices = _split_planes(level, _find_small(level, coarser[level.scale], wanted))
         elif level in small:
             if level is small[0]:
-                lattices = [y for x in lattices for y in _boards(remove_outliers(level, grow(level, x)))]
+                lattices = [y for x in lattices for y in _grown(level, x)]
             links = find_links(level, _mask(level, lattices) if lattices else None)
             masked = sum(int(x.seen.sum()) for x in lattices)
             if links is not None:
@@ -166,8 +166,8 @@ def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozense
             continue
         free[seed] = False
         first = linked_lattice(links, int(seed[1, 1]))
-        grid = remove_outliers(level, grow(level, refined(level, first, first.derivative_sigma, 1)))
-        boards = [x for x in _boards(grid) if is_smooth(level, x)]
+        grown = _grown(level, refined(level, first, first.derivative_sigma, 1))
+        boards = [x for x in grown if is_smooth(level, x)]
         if boards:
             found += boards
             nearest = max(nearest, _nearest_whole(boards, wanted))
@@ -188,9 +188,16 @@ def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     found = []
     for lattice in _find_new(part, links_of_part, [], frozenset()):
         pixels = lattice.pixels @ back[:, :2].T + back[:, 2]
-        grid = grow(level, refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
-        found += _boards(remove_outliers(level, grid))
+        found += _grown(level, refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
     return found
+
+
+def _grown(level: Level, lattice: Lattice) -> list[Lattice]:
+    """What a lattice grows into; each part grows again if it falls apart, as one over two boards does."""
+    parts = _boards(remove_outliers(level, grow(level, lattice)))
+    if len(parts) < 2:
+        return parts
+    return [y for x in parts for y in _boards(remove_outliers(level, grow(level, x)))]
 
 
 def _boards(lattice: Lattice) -> list[Lattice]:
