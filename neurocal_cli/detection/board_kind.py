@@ -82,10 +82,12 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
     states = set(ends.values())
     if {End.PATTERN, End.OUTSIDE} & states:
         vote = Vote.NONE
-    elif not _is_whole(foremost.seen):
-        vote = Vote.NONE if _near_border(foremost, grey.shape) else Vote.PART
+    elif states == {End.BOARD} and _least_outer(foremost.seen) >= _OUTER:
+        vote = Vote.SURE
+    elif _is_whole(foremost.seen):
+        vote = Vote.WHOLE
     else:
-        vote = Vote.SURE if states == {End.BOARD} else Vote.WHOLE
+        vote = Vote.NONE if _near_border(foremost, grey.shape) else Vote.PART
     light = grey_levels(grey)
     whole = [
         x
@@ -100,8 +102,12 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
 
 
 def _is_whole(seen: NDArray[np.bool_]) -> bool:
-    outer = min(float(line.mean()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
-    return bool(seen.mean() >= _COMPLETE and outer >= _OUTER)
+    return bool(seen.mean() >= _COMPLETE and _least_outer(seen) >= _OUTER)
+
+
+def _least_outer(seen: NDArray[np.bool_]) -> float:
+    """Least share of the vertices of an outer line that were found."""
+    return min(float(line.mean()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
 
 
 def _near_border(grid: Grid, shape: tuple[int, ...]) -> bool:

@@ -54,7 +54,7 @@ from neurocal_cli.detection.fitting.map_fit import select_map
 from neurocal_cli.detection.fitting.strips import GridEdges, GridImage, grid_lines
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
 from neurocal_cli.detection.grey import least_variance
-from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Grid, Measured
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Grid, Measured, squares_of
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.ink_fit import fit_with_ink
 from neurocal_cli.detection.medians import upper_median
@@ -69,6 +69,7 @@ _AGREES = 2.0
 _ENDS = np.array([[0, 0], [1, 0]])  # of an edge along c, from its first vertex
 _MOST_EXPLAINED = 0.8  # share of the unevenness
 _WORTH = 10.0  # greatest variance along an edge that is used, over that across it
+_FAINT = 0.1  # least contrast around a vertex, over that of the lit ones
 _OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to the rim is not used
 
 
@@ -88,6 +89,8 @@ def measure(
     whose fits are rejected are left out.
     """
     light = image if gamma is None else linearised(image, gamma)
+    if ink is None:
+        grid = _lit(light, grid)
     grid_image = GridImage(light, grid, least_variance(light))
     vertices = np.full(grid.pixels.shape, np.nan)
     if len(grid_image.edges.index) == 0:
@@ -108,6 +111,22 @@ def measure(
     rim, fitted_rim = fit_rim(grid_image, fitted)
     outer = _midpoints(rim, fitted_rim, fitted.unevenness, vertices)
     return inner.only(fitted.good).joined_with(outer.only(fitted_rim.good))
+
+
+def _lit(light: NDArray[np.generic], grid: Grid) -> Grid:
+    """The grid without the vertices in a deep shadow, where the levels of the lit squares tell nothing."""
+    centres = squares_of(grid.pixels).mean(axis=2)
+    known = np.isfinite(centres[..., 0])
+    level = np.full(known.shape, -np.inf)
+    u, v = np.rint(centres[known]).astype(np.intp).T
+    level[known] = light[v, u]
+    # The lightest and the darkest of the squares around each vertex.
+    around = (np.pad(x, 1, constant_values=-np.inf) for x in (level, np.where(known, -level, -np.inf)))
+    high, low = (np.maximum.reduce([x[:-1, :-1], x[:-1, 1:], x[1:, :-1], x[1:, 1:]]) for x in around)
+    contrast = high + low
+    usual = np.quantile(contrast[contrast > 0], 0.9) if (contrast > 0).any() else 0.0
+    faint = (contrast > 0) & (contrast < _FAINT * usual)
+    return replace(grid, pixels=np.where(faint[..., None], np.nan, grid.pixels)) if faint.any() else grid
 
 
 def linearised(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:

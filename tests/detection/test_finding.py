@@ -386,7 +386,7 @@ def test_saddles_settle_where_they_are() -> None:
     assert np.isnan(refine_saddles(image, np.array([[-5.0, 20.0], [np.nan, 3.0]]), 1.5)).all()
 
 
-@pytest.mark.parametrize("light", slow_but((0.35,), (0.5, 0.35, 0.2)))
+@pytest.mark.parametrize("light", slow_but((0.03,), (0.5, 0.35, 0.2, 0.03)))
 @pytest.mark.parametrize("seed", slow_but((0,), range(4)))
 def test_a_board_half_in_a_deep_shadow_is_found(light: float, seed: int) -> None:
     shot = picture("base", FIRST + seed)

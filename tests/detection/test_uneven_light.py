@@ -58,6 +58,15 @@ def test_both_sides_of_a_deep_shadow_are_measured(depth: float, points: Points) 
     found = together(half_in_shadow(depth, 4.0), points, range(2))
     assert found.kept > 0.8  # 0.43: the whole dark side was lost, or measured wrongly
     assert found.rms < 0.035  # 0.13
+
+
+@pytest.mark.parametrize("border", slow_but((1.5,), (1.5, 6.0)))
+@pytest.mark.parametrize("depth", slow_but((0.03,), (0.03, 0.05, 0.08)))
+def test_squares_in_almost_no_light_spoil_none_of_the_others(depth: float, border: float) -> None:
+    found = together(half_in_shadow(depth, border), "midpoints", range(4))
+    assert found.kept > 0.4
+    assert found.rms < 0.01  # 0.93
+    assert found.z < 1.5
     assert found.z < 2.0
     assert np.abs(found.error).max() < 0.2
 

@@ -90,7 +90,7 @@ class Level:
             parts = [self.image[v : v + _ROWS_OF_BAND, u : u + width] for v, u in places]
             bands = [Level(part, self.scale).curvature[1] for part in parts]
             sparse = np.concatenate([band[4:-4:4, 4:-4:4] for band in bands])
-        return max(float(np.median(np.abs(sparse))) / 0.6745, _LEAST_NOISE)
+        return max(float(np.median(np.abs(sparse))) / 0.6745, _LEAST_NOISE / self.scale)
 
 
 def grey_levels(image: NDArray[np.generic]) -> Image:
