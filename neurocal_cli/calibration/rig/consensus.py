@@ -14,10 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.reprojection import predicted_pixels
+from neurocal_cli.calibration.calibrate import calibrate, fit_poses
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
 from neurocal_cli.calibration.rig.adjust import rig_problem
 from neurocal_cli.calibration.rig.frames import FrameNames, ViewPairs, frames_of_pairs
@@ -25,6 +28,8 @@ from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, median, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.observations.points import Correspondences
 
 # Two pairs agree if their targets differ in the image by less than this share of the target's size or by less
 # than so many standard deviations of a pixel. The tests of named faults in test_stereo_evaluation.py
@@ -152,6 +157,53 @@ def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> t
             last, first = seen[seen < at].max(initial=0), seen[seen >= at].min(initial=n - 1)
             return gained, int(last), int(first)
     return None
+
+
+def exchanged_lenses(
+    problem: RigProblem, suspects: Sequence[int], place: NDArray[np.intp]
+) -> dict[tuple[int, int], tuple[int, int, int]]:
+    """As `exchanged`, of all pairs of some cameras, by how many frames clearly fit the lenses of both.
+
+    Files with images of several cameras may tell none of their poses. Lenses are those of the first third of
+    the views of each file, or of the last third, of which one is by one camera.
+    """
+    found: dict[tuple[int, int], tuple[int, int, int]] = {}
+    sides = {}
+    for c in suspects:
+        one = problem.calibrations[c]
+        points = one.points if one.target is None else one.target.as_given(one.points)
+        sides[c] = points, place[problem.observations[c].view]
+    for is_late in (False, True):
+        try:
+            lenses = {c: _of_third(*side, is_late) for c, side in sides.items()}
+            errors = {(c, d): _errors_of_views(sides[c][0], lenses[d]) for c in sides for d in sides}
+        except NeurocalError:
+            continue
+        for a, b in combinations(suspects, 2):
+            odds = np.zeros(len(place))
+            for own, other in ((a, b), (b, a)):
+                np.add.at(odds, sides[own][1], np.log(errors[own, own] / errors[own, other]))
+            votes = np.where(np.abs(odds) > -np.log(_NEARER), np.sign(odds), 0) * (-1 if is_late else 1)
+            at, clear = int(np.argmin(np.cumsum(np.append(0, votes)))), np.flatnonzero(votes)
+            fits = int((votes[:at] < 0).sum()), int((votes[at:] > 0).sum())
+            if min(fits) >= LEAST_AGREED and sum(fits) > AGREED * len(clear):
+                found[a, b] = sum(fits), int(clear[clear < at].max()), int(clear[clear >= at].min())
+    return found
+
+
+def _of_third(points: Correspondences, place: NDArray[np.intp], is_late: bool) -> Calibration:
+    """The camera of the first or last third of the views, whose places in the sequence are (V,)."""
+    order = np.argsort(place)[:: -1 if is_late else 1]
+    kept = np.isin(np.arange(len(place)), order[: len(place) // 3])
+    return calibrate(points.select(kept[points.view_index]), skew=False, target="given")
+
+
+def _errors_of_views(points: Correspondences, lens: Calibration) -> Array:
+    """(V,) median errors of the views with the poses that fit a camera [px]."""
+    state = fit_poses(points, lens.camera, lens.seed).state(points.view_names)
+    off = predicted_pixels(state, points.world, points.view_index)[0] - points.pixels
+    errors, view = np.linalg.norm(off, axis=1), points.view_index
+    return np.array([float(median(errors[view == k])) for k in range(points.n_views)])
 
 
 def _of_pairs(problem: RigProblem, pairs: Sequence[Pair]) -> RigProblem:

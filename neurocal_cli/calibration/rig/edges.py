@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import quietly
 from neurocal_cli.adjustment.normal_equations import solve_scaled
-from neurocal_cli.calibration.rig.adjust import RigFit
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import RigFit, is_significant
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA, along, seen_by
 from neurocal_cli.calibration.rig.consensus import (
     EXCHANGED,
@@ -33,11 +34,13 @@ from neurocal_cli.calibration.rig.consensus import (
     RigConsensus,
     all_shifted,
     exchanged,
+    exchanged_lenses,
     find_consensus,
     with_shifted,
 )
 from neurocal_cli.calibration.rig.frames import FrameNames, groups
 from neurocal_cli.calibration.rig.problem import RigProblem
+from neurocal_cli.calibration.verdict.evidence import evidence_of
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
@@ -45,9 +48,9 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 
 _PARTNERS = 4  # cameras with which each camera is compared, those with which it has most frames in common
-_SUSPECTS = (
-    6  # cameras of which two may have been exchanged, those that contradict the largest share of pairs
-)
+# Cameras of which two may have been exchanged, those that contradict the largest share of pairs; and those
+# whose lenses are compared.
+_SUSPECTS, _WITH_LENSES = 6, 3
 
 # Share of the frames of an edge that must agree on one relative pose: where the target moves between late
 # images, only those in which it is slow agree.
@@ -284,19 +287,30 @@ def exchanged_cameras(
         n_odd[list(edge.cameras)] += len(edge.consensus.reasons) - edge.n_agreed
     most = np.argsort(-n_odd / np.maximum(n_all, 1), kind="stable")[:_SUSPECTS]
     suspects = sorted(most[n_odd[most] >= LEAST_AGREED].tolist())
-    word = [next(iter(views.values())) for views in problem.views]
     place = np.argsort(sequence)
-    best, told = 0, ""
+    found = {}
     for a, b in combinations(suspects, 2):
-        found = exchanged(problem, a, b, place)
         others = sum(len(e.consensus.reasons) - e.n_agreed for e in edges if {a, b}.isdisjoint(e.cameras))
-        if found is not None and found[0] > max(best, others):
-            best, (last, first) = found[0], (word[sequence[k]] for k in found[1:])
-            told = (
-                f"the images of cameras {names[a]} and {names[b]} were exchanged between {last} and {first}; "
-                "exchange the names of these cameras in one of the two parts"
-            )
-    return told
+        one = exchanged(problem, a, b, place)
+        if one is not None and one[0] > others:
+            found[a, b] = one
+    worst = [c for c in suspects if c in most[:_WITH_LENSES]]
+    if not found and any(_is_of_several(problem.calibrations[c]) for c in worst):
+        found = exchanged_lenses(problem, worst, place)
+    if not found:
+        return ""
+    (a, b), (_, *around) = max(found.items(), key=lambda one: one[1])
+    last, first = (next(iter(problem.views[sequence[k]].values())) for k in around)
+    return (
+        f"the images of cameras {names[a]} and {names[b]} were exchanged between {last} and {first}; "
+        "exchange the names of these cameras in one of the two parts"
+    )
+
+
+def _is_of_several(camera: Calibration) -> bool:
+    """Whether the views of a camera contradict each other by more than noise."""
+    seen = evidence_of(camera, ())
+    return seen is None or is_significant(seen.spare * seen.contradiction**2, round(seen.spare))
 
 
 def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list[int]]) -> str:

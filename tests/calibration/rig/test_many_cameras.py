@@ -397,6 +397,18 @@ def test_cameras_that_have_each_others_images_from_some_frame_on_are_named(
         calibrate_rig(points, skew=False, distortion="k1k2", target="given")
 
 
+@pytest.mark.parametrize("seed", slow_but((0,), (0, 1, 2, 3)))
+def test_so_are_those_of_lenses_that_differ(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = random_rig("line", 3, 18, rng, n_fisheyes=1).points(SIGMA, rng)
+    first, second = points["cam0"], points["cam1"]
+    for name, before, after in (("cam0", first, second), ("cam1", second, first)):
+        points[name] = joined(of_frames(before, lambda k: k < 9), of_frames(after, lambda k: k >= 9))
+    told = "the images of cameras cam0 and cam1 were exchanged between 00[78] and 009"
+    with pytest.raises(NeurocalError, match=told):
+        calibrate_rig(points, skew=False, distortion="fisheye", target="given")
+
+
 def test_the_exchanged_images_of_one_frame_are_named() -> None:
     _, points = scene("line", 4, 20)
     one, other = points["cam1"], points["cam2"]
