@@ -36,7 +36,14 @@ from neurocal_cli.detection.markers.lattice import (
     tell_a_plane,
 )
 from neurocal_cli.detection.markers.locate import locate
-from neurocal_cli.detection.markers.reading import Marks, candidates, looks_at, markers_in, numbers_in
+from neurocal_cli.detection.markers.reading import (
+    Marks,
+    candidates,
+    looks_at,
+    markers_in,
+    numbers_in,
+    read_codes,
+)
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.detection.wide_lens import Flattening, WideLens
@@ -383,6 +390,21 @@ def test_the_outline_inside_a_blurred_border_is_not_that_of_the_marker() -> None
     for number, corners in zip(marks.number, marks.corners, strict=True):
         true = np.array([places[f"{number}:{k}"] for k in range(4)])
         assert np.linalg.norm(corners[:, None] - true, axis=2).min(axis=0).max() < 2.5
+
+
+def test_small_markers_are_read_within_their_true_sides() -> None:
+    """Cells of 3.5 px are blurred by half of one, so that outlines are 1.7 px too small."""
+    read = []
+    for seed in range(3):
+        scene = marked_scene(
+            plane_of("charuco:6x4:40:32:DICT_4X4_50"), seed, square=26.0, tilt=20.0, psf=1.76
+        )
+        codes = {
+            (marks.dictionary, border): marks for marks, border in read_codes(taken(scene, seed).image)[0]
+        }
+        read += codes["DICT_4X4_1000", 1].number.tolist()
+    assert max(read) < 12
+    assert len(read) >= 27  # 20 of 36 within the outlines
 
 
 def test_all_clear_codes_of_a_dictionary_are_read() -> None:

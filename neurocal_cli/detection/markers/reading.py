@@ -207,7 +207,7 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
             if DICTIONARIES[dictionary] == bits:
                 marks = _marks(corners[which], light, dictionary)
                 if len(marks) >= _FEWEST:
-                    yield _on_edges(grey, marks), border
+                    yield marks, border
 
 
 def markers_in(
@@ -216,7 +216,7 @@ def markers_in(
     """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
     H, corners = _framed(grey, corners)
     which, light = _cells(grey, H, DICTIONARIES[dictionary], border, _ROUGHLY_WRONG)
-    return _on_edges(grey, _marks(corners[which], light, dictionary, first, count))
+    return _marks(corners[which], light, dictionary, first, count)
 
 
 def _marks(
@@ -251,13 +251,12 @@ _ACROSS_SIDES = (
 ).reshape(-1, 2)
 
 
-def _on_edges(grey: NDArray[np.uint8], marks: Marks) -> Marks:
-    """Markers with their sides moved to where their dark borders end, which is exact to a tenth of a pixel.
+def _on_edges(grey: NDArray[np.uint8], corners: Array, H: Array) -> Array:
+    """Quadrangles (N, 4, 2) with their sides moved to where their dark borders end.
 
-    Where squares touch the corners of tags, only the inner outlines of blurred borders may be found.
+    That is exact to a tenth of a pixel. Outlines of blurred borders lie a pixel or two inside them, and where
+    squares touch the corners of tags, only the inner outlines of the borders may be found.
     """
-    corners = marks.corners
-    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     level = _sampled(grey, H, _ACROSS_SIDES).reshape(len(H), 8, len(_FIRST), len(_OUTWARDS)).mean(axis=2)
     dark = level[..., :_WITHIN_BORDER].argmin(axis=2)[..., None]
     low = np.take_along_axis(level, dark, axis=2)
@@ -274,7 +273,7 @@ def _on_edges(grey: NDArray[np.uint8], marks: Marks) -> Marks:
     with np.errstate(divide="ignore", invalid="ignore"):
         met = met[..., :2] / met[..., 2:]
     seen = (half - low > 0.5 * _CONTRAST).all(axis=(1, 2)) & np.isfinite(met).all(axis=(1, 2))
-    return replace(marks, corners=np.where(seen[:, None, None], met, corners))
+    return np.where(seen[:, None, None], met, corners)
 
 
 def numbers_in(
@@ -289,13 +288,17 @@ def numbers_in(
 
 
 def _framed(grey: NDArray[np.uint8], corners: Array) -> tuple[Array, Array]:
-    """Homographies (M, 3, 3) and corners of the quadrangles whose rims are mostly dark, as markers' are."""
+    """Homographies (M, 3, 3) and corners of the quadrangles whose rims are mostly dark, as markers' are.
+
+    Their sides are moved to the ends of the rims.
+    """
     H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     sampled = _sampled(grey, H, np.concatenate([_AROUND, _INSIDE]))
     low, high = _levels(sampled)
     light = sampled[:, : len(_AROUND)] > 0.5 * (low + high)[:, None]
     framed = (light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST)
-    return H[framed], corners[framed]
+    corners = _on_edges(grey, corners[framed], H[framed])
+    return homographies(np.broadcast_to(_UNIT, corners.shape), corners), corners
 
 
 def _sampled(grey: NDArray[np.uint8] | Image, H: Array, places: Array) -> Array:
