@@ -8,7 +8,10 @@ from neurocal_cli.camera.geometry import Array
 
 
 def homographies(ground: Array, pixels: Array, weight: Array | None = None) -> Array:
-    """Homographies (M, 3, 3) by linear least squares through K points each, (M, K, 2) to (M, K, 2)."""
+    """Homographies (M, 3, 3) by linear least squares through K points each, (M, K, 2) to (M, K, 2).
+
+    The places may be the same for all, (1, K, 2).
+    """
     centre, middle = ground.mean(axis=1, keepdims=True), pixels.mean(axis=1, keepdims=True)
     size, scale = (np.maximum(np.abs(x).max(axis=(1, 2)), 1e-9) for x in (ground - centre, pixels - middle))
     places, seen = (
@@ -35,7 +38,7 @@ def homographies(ground: Array, pixels: Array, weight: Array | None = None) -> A
 
 
 def homography_at(H: Array, ground: Array) -> Array:
-    """Pixels of places by homographies; (M, 3, 3) and (M, K, 2)."""
+    """Pixels of places by homographies; (M, 3, 3) and (M, K, 2), or (1, K, 2) if they are the same for all."""
     mapped = H[:, :, :2] @ ground.swapaxes(1, 2) + H[:, :, 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((mapped[:, :2] / mapped[:, 2:]).swapaxes(1, 2))

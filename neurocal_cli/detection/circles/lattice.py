@@ -120,8 +120,8 @@ def _outlines(dark: NDArray[np.bool_], origin: tuple[int, int] = (0, 0)) -> list
     every, _ = cv2.findContours(dark.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE, offset=origin)
     return [
         np.asarray(x)[:, 0]
-        for x in every
-        if len(x) >= _SHORTEST and cv2.contourArea(x) + len(x) / 2 >= _COMPACT * len(x) ** 2
+        for x, n in zip(every, map(len, every), strict=True)
+        if n >= _SHORTEST and cv2.contourArea(x) + n / 2 >= _COMPACT * n**2
     ]
 
 

@@ -341,7 +341,7 @@ def window(half: int, width: int) -> NDArray[np.intp]:
 def interpolate(image: NDArray[np.uint8] | Image, points: NDArray[np.floating]) -> Array:
     """Interpolate an image linearly at points (..., 2) [px], repeating the border outside."""
     flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
-    maps = flat.astype(np.float32, copy=False)
+    maps = np.ascontiguousarray(flat, dtype=np.float32)
     parts = [
         cv2.remap(image, maps[k : k + _ROWS], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
         for k in range(0, len(maps), _ROWS)

@@ -367,11 +367,11 @@ def _side(picture: _Picture, rough: float, border: float) -> tuple[float, float]
     if not len(corners):
         return np.nan, np.nan
     sides = np.concatenate([np.roll(corners, turn, axis=1) for turn in range(4)])
-    unit = np.broadcast_to(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), sides.shape)
+    unit = np.array([[[0.0, 0], [1, 0], [1, 1], [0, 1]]])
     inset = 0.5 * (1 - rough)
     a = _ACROSS[inset + _BORDER * border * rough > _ACROSS]
     places = np.stack(np.meshgrid(a, _ALONG), axis=-1).reshape(1, -1, 2)
-    at = homography_at(homographies(unit, sides), np.broadcast_to(places, (len(sides), *places.shape[1:])))
+    at = homography_at(homographies(unit, sides), places)
     lights = interpolate(light, at).reshape(len(sides), len(_ALONG), len(a)).mean(axis=1)
     low, high = lights.min(axis=1, keepdims=True), lights.max(axis=1, keepdims=True)
     seen = np.median((lights - low) / np.maximum(high - low, 1e-6), axis=0)

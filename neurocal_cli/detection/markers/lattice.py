@@ -143,10 +143,10 @@ def agreement(
     which = np.flatnonzero(inside)
     which = which[np.isfinite(squares[r[which], c[which]]).all(axis=(1, 2))]
     at = squares[r[which], c[which]]
-    H = homographies(np.broadcast_to(_OF_SQUARE, at.shape), at)
+    H = homographies(_OF_SQUARE[None], at)
     middle = 0.5 * (lines[1:] + lines[:-1])
     places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
-    seen = interpolate(image, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
+    seen = interpolate(image, homography_at(H, places[None]))
     codes = light[which].reshape(len(which), len(places))
     return which, H, (_standard(seen) * _standard(codes)).sum(axis=1)
 

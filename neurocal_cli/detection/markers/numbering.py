@@ -88,10 +88,10 @@ def lie_of(marks: Marks) -> Lie | None:
 def _neighbours(marks: Marks) -> tuple[Array, NDArray[np.bool_]]:
     """(N, N, 2) places of markers in the frame of each, and (N, N) whether they may be neighbours."""
     n = len(marks)
-    H = homographies(np.broadcast_to(UNIT, (n, 4, 2)), marks.corners)
+    H = homographies(UNIT[None], marks.corners)
     with np.errstate(all="ignore"):
         inverse = np.asarray(np.linalg.inv(H), dtype=np.float64)
-        seen = homography_at(inverse, np.broadcast_to(marks.corners.reshape(1, -1, 2), (n, 4 * n, 2)))
+        seen = homography_at(inverse, marks.corners.reshape(1, -1, 2))
         seen = seen.reshape(n, n, 4, 2)
         offset = seen.mean(axis=2)
         right, down = seen[:, :, 1] - seen[:, :, 0], seen[:, :, 3] - seen[:, :, 0]

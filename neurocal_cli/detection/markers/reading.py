@@ -281,7 +281,7 @@ def numbers_in(
 ) -> NDArray[np.int64]:
     """Numbers (N,) of the markers of a dictionary within quadrangles (N, 4, 2), clockwise; -1 for none."""
     number = np.full(len(corners), -1)
-    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    H = homographies(_UNIT[None], corners)
     which, cells = _cells(light, H, DICTIONARIES[dictionary], border)
     number[which] = _matched(cells, dictionary)[0]
     return number
@@ -292,18 +292,18 @@ def _framed(grey: NDArray[np.uint8], corners: Array) -> tuple[Array, Array]:
 
     Their sides are moved to the ends of the rims.
     """
-    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    H = homographies(_UNIT[None], corners)
     sampled = _sampled(grey, H, np.concatenate([_AROUND, _INSIDE]))
     low, high = _levels(sampled)
     light = sampled[:, : len(_AROUND)] > 0.5 * (low + high)[:, None]
     framed = (light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST)
     corners = _on_edges(grey, corners[framed], H[framed])
-    return homographies(np.broadcast_to(_UNIT, corners.shape), corners), corners
+    return homographies(_UNIT[None], corners), corners
 
 
 def _sampled(grey: NDArray[np.uint8] | Image, H: Array, places: Array) -> Array:
     """Grey levels (N, K) at places (K, 2) of each quadrangle."""
-    return interpolate(grey, homography_at(H, np.broadcast_to(places, (len(H), *places.shape))))
+    return interpolate(grey, homography_at(H, places[None]))
 
 
 def _levels(grey: Array) -> tuple[Array, Array]:
@@ -320,12 +320,10 @@ def _cells(
     side, which, inner = bits + 2 * border, np.arange(len(H)), np.zeros((len(H), bits, bits), dtype=np.bool_)
     # A look at the middles of the cells leaves few.
     for within, rounds, most in (((0.0,), 1, _ROUGHLY_WRONG), (_WITHIN, _ROUNDS, wrong_border)):
-        ticks = (np.arange(-rounds, side + rounds)[:, None] + 0.5 + np.array(within)).ravel() / side
-        places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         if not len(which):
             break
-        every = len(which), side + 2 * rounds, len(within), side + 2 * rounds, len(within)
-        level = _sampled(grey, H[which], places).reshape(every).mean(axis=(2, 4))
+        places = _places(side, rounds, within)
+        level = _sampled(grey, H[which], places.reshape(-1, 2)).reshape(-1, *places.shape[:3]).mean(axis=1)
         low, high = _levels(level[:, rounds:-rounds, rounds:-rounds].reshape(len(which), -1))
         for _ in range(rounds):
             columns, rows = level[:, 1:-1], level[:, :, 1:-1]
@@ -338,6 +336,14 @@ def _cells(
         good = (wrong <= most * (side * side - bits * bits)) & (high - low > _CONTRAST)
         which, inner = which[good], inner[good]
     return which, inner
+
+
+@lru_cache
+def _places(side: int, rounds: int, within: tuple[float, ...]) -> Array:
+    """Samples (M, n, n, 2) of the cells of a marker, and so many rounds of cells beside it, along its side."""
+    ticks = (np.arange(-rounds, side + rounds) + 0.5 + np.array(within)[:, None]) / side
+    places = np.broadcast_arrays(ticks[None, :, None, :], ticks[:, None, :, None])
+    return np.stack(places, axis=-1).reshape(-1, *2 * ticks.shape[1:], 2)
 
 
 def _matched(
