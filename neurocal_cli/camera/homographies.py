@@ -38,7 +38,7 @@ def homographies(ground: Array, pixels: Array, weight: Array | None = None) -> A
 
 
 def homography_at(H: Array, ground: Array) -> Array:
-    """Pixels of places by homographies; (M, 3, 3) and (M, K, 2), or (1, K, 2) if they are the same for all."""
+    """Pixels of places by homographies; (M, 3, 3) and (M, K, 2), or (1, K, 2) of the same for all."""
     mapped = H[:, :, :2] @ ground.swapaxes(1, 2) + H[:, :, 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((mapped[:, :2] / mapped[:, 2:]).swapaxes(1, 2))

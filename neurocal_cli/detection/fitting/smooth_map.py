@@ -77,8 +77,8 @@ def _between_lines(grid: Array, lines: tuple[Array, Array] | None) -> Array:
         return grid
     columns = []
     for place, at in zip(grid.T + 1, lines, strict=True):
-        first = np.clip(np.floor(place).astype(np.intp), 0, len(at) - 2)
-        columns.append(at[first] + (place - first) * (at[first + 1] - at[first]))
+        first = np.minimum(np.maximum(place.astype(np.intp), 0), len(at) - 2)
+        columns.append(at[first] + (place - first) * np.diff(at)[first])
     return np.stack(columns, axis=-1)
 
 

@@ -214,7 +214,8 @@ def _profiles(
     sign, room = (x.astype(np.float32)[:, None] for x in (side, gap))
     per_sigma = (1 / sigmas).astype(np.float32)[:, None, None, None]
     x = erf_and_density(moved * per_sigma)[0]
-    x -= sign * near[:, None] * (1 + erf_and_density((sign * moved - room) * per_sigma)[0])
+    if near.any():
+        x -= sign * near[:, None] * (1 + erf_and_density((sign * moved - room) * per_sigma)[0])
     # The line through the profile over x.
     sum_x, product_x, squares = (
         np.einsum(f"soen{of}->soe", x, *other, dtype=float)

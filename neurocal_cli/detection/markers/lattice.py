@@ -164,7 +164,7 @@ def _agreeing(ground: Array, pixels: Array) -> NDArray[np.intp]:
         return np.zeros(0, dtype=np.intp)
     middle = ground.mean(axis=1)
     first, second = np.triu_indices(n, 1)
-    near = np.abs(middle[first] - middle[second]).max(axis=1) < _NEAR
+    near = _apart(middle, middle)[first, second] < _NEAR
     first, second = first[near], second[near]
     both = np.concatenate([ground[first], ground[second]], axis=1)
     seen = np.concatenate([pixels[first], pixels[second]], axis=1)
@@ -179,6 +179,12 @@ def _agreeing(ground: Array, pixels: Array) -> NDArray[np.intp]:
         if (label == before).all():
             break
     return np.flatnonzero(label == np.bincount(label).argmax())
+
+
+def _apart(places: Array, others: Array) -> Array:
+    """Distances (N, M) of places (N, 2) from others (M, 2) along the axis along which they are farther."""
+    x, y = (np.abs(one[:, None] - other) for one, other in zip(places.T, others.T, strict=True))
+    return np.asarray(np.maximum(x, y))
 
 
 def _area(corners: Array) -> Array:
@@ -270,7 +276,7 @@ def leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: F
         # No others tell where one that is alone should be.
         off = np.nan_to_num(np.hypot(*(pixels - start).T), nan=np.inf)
         side = np.sqrt(np.abs(np.linalg.det(cell)))
-        near = np.abs(places[:, None] - places).max(axis=2) < _AROUND
+        near = _apart(places, places) < _AROUND
         stray = (off > _STRAY * side + _STRAY_PX) & (off >= np.where(near, off, 0.0).max(axis=1))
         if not stray.any():
             return
@@ -288,7 +294,7 @@ def predicted(
     """
     flat = flattening.flat(pixels)
     known, flat = known[ahead := np.isfinite(flat).all(axis=1)], flat[ahead]
-    away = np.abs(ground[:, None] - known).max(axis=2)
+    away = _apart(ground, known)
     if not itself:
         away[away < _SAME] = np.inf
     count = min(24, len(known))

@@ -340,7 +340,7 @@ def _cells(
 
 @lru_cache
 def _places(side: int, rounds: int, within: tuple[float, ...]) -> Array:
-    """Samples (M, n, n, 2) of the cells of a marker, and so many rounds of cells beside it, along its side."""
+    """Samples (M, n, n, 2) of the cells of a marker and of some rounds of cells beside it, over its side."""
     ticks = (np.arange(-rounds, side + rounds) + 0.5 + np.array(within)[:, None]) / side
     places = np.broadcast_arrays(ticks[None, :, None, :], ticks[:, None, :, None])
     return np.stack(places, axis=-1).reshape(-1, *2 * ticks.shape[1:], 2)
