@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field, fields, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -202,7 +203,7 @@ class Observations:
             np.zeros((2 * n, shifts)),
         )
 
-    @property
+    @cached_property
     def informative(self) -> NDArray[np.bool_]:
         """(N,) mask of the observations that determine the map; anchors do not, and may be more than half."""
         quarter = len(self.variance) // 4

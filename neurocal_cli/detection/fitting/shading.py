@@ -209,7 +209,8 @@ def _fit(frame: Frame, levels: Levels) -> Polynomial:
     chance, count, before = _scatter(residual, most), 0.0, np.zeros(_TERMS[-1])
     coefficients[:] = 0
     for fewer, used in pairwise((0, *(m for m in _TERMS if m <= most))):
-        found = np.pad(_refit(terms[:, :used], levels, residual, spread)[0], (0, _TERMS[-1] - used))
+        found = np.zeros(_TERMS[-1])
+        found[:used] = _refit(terms[:, :used], levels, residual, spread)[0]
         explained = ((terms @ (found - before)) ** 2).sum()
         share = max(1 - _CHANCE * (used - fewer) * chance / max(explained, _TINY), 0.0) if fewer else 1.0
         coefficients += share * (found - before)

@@ -222,7 +222,7 @@ class _Blurred:
     def of(cls, slopes: Sequence[Array], blur: Array, shift: float, tails: Array) -> _Blurred:
         """From the derivatives of a and b by the pixel, and the blur of cells as in `Appearance`."""
         au, av, bu, bv = slopes
-        across_a, across_b = np.hypot(au, av), np.hypot(bu, bv)
+        across_a, across_b = np.sqrt(au * au + av * av), np.sqrt(bu * bu + bv * bv)
         rho = np.clip(blur[:, 2], -_MOST_RHO, _MOST_RHO)
         shifts = shift * across_a.mean(axis=1), shift * across_b.mean(axis=1)
         return cls(
