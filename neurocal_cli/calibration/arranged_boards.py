@@ -120,7 +120,7 @@ def _arrangement(points: Points, cameras: Mapping[str, Calibration], boards: lis
             pose, agreed, seen = _relation(points, cameras, (a, b))
             if agreed >= max(_FEWEST, _LEAST_AGREED * seen):
                 links[a, b] = pose, agreed
-                links[b, a] = Pose(pose.R.T, -pose.R.T @ pose.t), agreed
+                links[b, a] = pose.inverse, agreed
     best = _Arrangement({}, 0)
     for first in boards:
         poses, agreed = {first: Pose(np.eye(3), np.zeros(3))}, 0
@@ -128,8 +128,7 @@ def _arrangement(points: Points, cameras: Mapping[str, Calibration], boards: lis
             (links[pair][1], pair) for pair in links if pair[0] in poses and pair[1] not in poses
         ]:
             count, (a, b) = max(open_ends)
-            step, before = links[a, b][0], poses[a]
-            poses[b] = Pose(before.R @ step.R, before.R @ step.t + before.t)
+            poses[b] = poses[a].after(links[a, b][0])
             agreed += count
         if len(poses) > len(best.poses):
             best = _Arrangement(poses, agreed)

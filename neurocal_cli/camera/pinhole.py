@@ -164,6 +164,15 @@ class Pose:
         """Pose from Euler angles [rad] and a translation."""
         return cls(euler_to_rotation(R_x, R_y, R_z), t)
 
+    @property
+    def inverse(self) -> Pose:
+        """Camera to world, ``M = R^T (Xc - t)``; its t is the camera's position."""
+        return Pose(self.R.T, -self.R.T @ self.t)
+
+    def after(self, first: Pose) -> Pose:
+        """Two poses, one after the other: ``X'' = R (R1 X + t1) + t``."""
+        return Pose(self.R @ first.R, self.R @ first.t + self.t)
+
     def relative_to(self, other: Pose) -> Pose:
         """The pose of this camera in the frame of another one: ``X_self = R X_other + t``."""
         R = self.R @ other.R.T

@@ -113,6 +113,16 @@ def test_a_pose_takes_the_nearest_exact_rotation_and_keeps_an_exact_one_bit_by_b
     np.testing.assert_allclose(rounded @ rounded.T, np.eye(3), atol=1e-15)
 
 
+@quick
+@given(poses, poses)
+def test_poses_one_after_the_other_and_back(first: Pose, second: Pose) -> None:
+    world = np.array([[0.0, 0.0, 0.0], [100.0, -20.0, 7.0]])
+    there = second.after(first)
+    np.testing.assert_allclose(there.to_camera(world), second.to_camera(first.to_camera(world)), atol=1e-9)
+    np.testing.assert_allclose(there.inverse.to_camera(there.to_camera(world)), world, atol=1e-9)
+    np.testing.assert_allclose(there.after(first.inverse).t, there.relative_to(first).t, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("R", "t", "word"),
     [

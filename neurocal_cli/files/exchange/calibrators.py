@@ -21,7 +21,7 @@ from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.document import Document, damaged
-from neurocal_cli.files.exchange.format_table import STILL, CameraSet, Format, PoseKeys, Tree, after, inverse
+from neurocal_cli.files.exchange.format_table import STILL, CameraSet, Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import python_text, yaml_text
 from neurocal_cli.files.tree_fields import Field
 
@@ -51,7 +51,7 @@ def _kalibr_poses(parts: Mapping[str, Field]) -> list[Pose | None]:
                 return imu
             part["T_cn_cnm1"].array(4, 4)  # it is missing
         else:
-            chained.append(after(step, chained[-1]))
+            chained.append(step.after(chained[-1]))
     return [None] if len(parts) == 1 else [*chained]
 
 
@@ -61,7 +61,7 @@ def _camchain(trees: list[Tree], cameras: CameraSet) -> Tree:
         tree["cam_overlaps"] = [n for n in range(len(trees)) if n != k]
         tree.setdefault("distortion_coeffs", [])
         if k:
-            _STEP.put(tree, after(cameras.mounted[k], inverse(cameras.mounted[k - 1])))
+            _STEP.put(tree, cameras.mounted[k].after(cameras.mounted[k - 1].inverse))
     return {f"cam{k}": tree for k, tree in enumerate(trees)}
 
 
@@ -142,7 +142,7 @@ def _multical_parts(document: Document) -> dict[str, Field]:
             own, _, other = name.partition("_to_")
             pose = _A_TO_B.read(entry)
             if pose is not None and (not other or other in poses):
-                poses[own] = after(pose, poses[other]) if other else pose
+                poses[own] = pose.after(poses[other]) if other else pose
     parts = document.root["cameras"].entries()
     for name, part in parts.items():
         if name in poses:

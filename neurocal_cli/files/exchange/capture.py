@@ -21,7 +21,7 @@ from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import toml_text
 from neurocal_cli.files.tree_fields import Field
 
@@ -158,7 +158,7 @@ def dlt_coefficients(cameras: CameraSet) -> Array:
         placed = [(name, cameras.cameras[0], pose) for name, pose in views]
     else:
         pairs = zip(cameras.cameras, cameras.mounted, strict=True)
-        placed = [(camera.name, camera, after(mounted, views[0][1])) for camera, mounted in pairs]
+        placed = [(camera.name, camera, mounted.after(views[0][1])) for camera, mounted in pairs]
     found = []
     for name, camera, pose in placed:
         P = camera.A @ pose.D

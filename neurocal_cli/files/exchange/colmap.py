@@ -19,7 +19,7 @@ from typing import Any
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.document import Document, damaged
-from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after, to_quaternion
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, to_quaternion
 from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.tree_fields import Field, is_number
 from neurocal_cli.files.yaml_text import number
@@ -262,7 +262,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
             data.append(f"CAMERA {k} {image}")
             # As in COLMAP's rigs, the images of each camera are in a folder with its name.
             name = f"camera{k}/{_word(view)}" if len(rig) > 1 else _word(view)
-            files["images.txt"] += [f"{image} {_seven(after(mounted, pose))} {k} {name}", ""]
+            files["images.txt"] += [f"{image} {_seven(mounted.after(pose))} {k} {name}", ""]
         files["frames.txt"].append(f"{frame} 1 {_seven(pose)} {len(rig)} {' '.join(data)}")
     return {name: _joined(lines) for name, lines in files.items()}
 

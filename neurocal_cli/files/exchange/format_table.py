@@ -145,16 +145,6 @@ def from_quaternion(q: Array) -> Array:
     return np.asarray(Rotation.from_quat(np.roll(np.asarray(q, dtype=float), -1)).as_matrix())
 
 
-def inverse(pose: Pose) -> Pose:
-    """Inverse of a pose."""
-    return Pose(pose.R.T, -pose.R.T @ pose.t)
-
-
-def after(second: Pose, first: Pose) -> Pose:
-    """Compose two poses: ``X'' = R2 (R1 X + t1) + t2``."""
-    return Pose(second.R @ first.R, second.R @ first.t + second.t)
-
-
 Tree = dict[str, Any]
 Parts = Mapping[str, Field]  # the tree of each camera of a file, by its name
 _SIZES = (3, 4, 9), (3,)  # numbers of a rotation and a translation
@@ -202,11 +192,11 @@ class PoseKeys:
         form = {3: from_vector, 4: from_quaternion}.get(len(rotation))
         R = rotation.reshape(3, 3) if form is None else form(rotation)
         pose = Pose(R, -R @ t if self.centre else t)
-        return inverse(pose) if self.back else pose
+        return pose.inverse if self.back else pose
 
     def put(self, tree: Tree, pose: Pose) -> None:
         """Write a pose."""
-        pose = inverse(pose) if self.back else pose
+        pose = pose.inverse if self.back else pose
         form = {"vector": to_vector, "quaternion": to_quaternion}.get(self.paths[0].rpartition(":")[2])
         rotation = pose.R if form is None else form(pose.R)
         if len(self.paths) == 2:
@@ -326,7 +316,7 @@ class Format(CameraKeys):
         if not others:
             views = {getattr(self.pose, "frame", "body"): pose for pose in known}
         elif len(known) == len(cameras):
-            relative = tuple(after(pose, inverse(known[0])) for pose in known[1:])
+            relative = tuple(pose.after(known[0].inverse) for pose in known[1:])
         unit = self.unit(first) if callable(self.unit) else self.unit if poses else None
         return CameraSet(cameras, relative, views, unit, program=self.program)
 

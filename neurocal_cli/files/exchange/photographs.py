@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree, after
+from neurocal_cli.files.exchange.format_table import CameraSet, Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import json_text
 from neurocal_cli.files.tree_fields import Field
 
@@ -65,14 +65,14 @@ def _nerf_views(root: Field) -> dict[str, Pose]:
     poses = {}
     for k, frame in enumerate(root.get("frames", []).items()):
         if (pose := _FRAME.read(frame)) is not None:
-            poses[frame.get("file_path", str(k)).text()] = after(_FLIP, pose)
+            poses[frame.get("file_path", str(k)).text()] = _FLIP.after(pose)
     return poses
 
 
 def _with_frames(trees: list[Tree], cameras: CameraSet) -> Tree:
     frames: list[Tree] = [{"file_path": name} for name in cameras.poses]
     for frame, pose in zip(frames, cameras.poses.values(), strict=True):
-        _FRAME.put(frame, after(_FLIP, pose))
+        _FRAME.put(frame, _FLIP.after(pose))
     return {**trees[0], "frames": frames}
 
 

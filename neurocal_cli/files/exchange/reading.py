@@ -39,7 +39,7 @@ from neurocal_cli.files.exchange import (
 from neurocal_cli.files.exchange.adaptation import adapt_cameras
 from neurocal_cli.files.exchange.corners import read_corners
 from neurocal_cli.files.exchange.document import KALIBR_REPORT, UNKNOWN, Document, NoCameraError
-from neurocal_cli.files.exchange.format_table import CameraSet, Format, after, inverse
+from neurocal_cli.files.exchange.format_table import CameraSet, Format
 from neurocal_cli.files.exchange.neurocal import camera_set
 from neurocal_cli.files.exchange.tree_paths import in_rows
 from neurocal_cli.observations.board import Board
@@ -369,7 +369,7 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
             "ROS or of mrcal, or the file of the rig"
         )
     (frame,) = common
-    pose = after(right.poses[frame], inverse(left.poses[frame]))
+    pose = right.poses[frame].after(left.poses[frame].inverse)
     return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})
 
 

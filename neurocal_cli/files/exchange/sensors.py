@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.format_table import STILL, Format, PoseKeys, Tree, after, inverse
+from neurocal_cli.files.exchange.format_table import STILL, Format, PoseKeys, Tree
 from neurocal_cli.files.exchange.tree_paths import in_order
 from neurocal_cli.files.image_files import read_header
 from neurocal_cli.files.tree_fields import Field
@@ -131,7 +131,7 @@ def _oak_poses(parts: Mapping[str, Field]) -> list[Pose | None]:
     for _ in parts:
         for name, part in parts.items():
             if name not in roots and to[name] in poses and (link := _TO_SOCKET.read(part)) is not None:
-                poses[sockets[name]] = after(inverse(link), poses[to[name]])
+                poses[sockets[name]] = link.inverse.after(poses[to[name]])
     return [poses.get(sockets[name]) for name in parts]
 
 
