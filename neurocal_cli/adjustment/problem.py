@@ -143,7 +143,9 @@ class Problem:
         return replace(self, views=replace(views, pixels=pixels), turned=None)
 
     def as_seen(self, state: CameraState) -> tuple[Problem, CameraState]:
-        """Undo the removal of a given distortion: the problem with observed pixels, and its state."""
+        """Undo the removal of a given distortion, if there is one: with observed pixels, and their state."""
+        if self.distortion.model == "none" or self.free_distortion:
+            return self, state
         state = replace(state, model=self.distortion.model, k=self.distortion.coefficients)
         if self.turned is not None:
             back = np.swapaxes(self.turned, 1, 2)
@@ -307,10 +309,7 @@ def _check_fixed(name: str, value: float, fixed: Collection[str], type: int, ske
 
 
 def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
-    centre = image_center if image_center is not None else points.image_center
-    if centre is None and points.image_size is not None:
-        # Pixel centres run from 0 to the size less 1.
-        centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
+    centre = image_center if image_center is not None else points.assumed_centre
     if centre is None:
         raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
     try:

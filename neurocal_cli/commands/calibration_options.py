@@ -164,21 +164,17 @@ class Estimation:
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
         """The image centre of type 2: from the option, the points' header, or the middle of the image."""
-        if self.image_center is not None:
-            return self.image_center
-        if points.image_center is not None:
-            return points.image_center
-        if points.image_size is None:
+        center = self.image_center or points.assumed_centre
+        if center is None:
             raise UsageError(
                 f"--type 2 needs the image centre, but {points.source} has neither image_center nor "
                 "image_size; give --image-center U V"
             )
-        width, height = points.image_size
-        center = (width - 1) / 2, (height - 1) / 2
-        warn(
-            "no image centre is given, so the middle of the image, "
-            f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
-        )
+        if self.image_center is None and points.image_center is None:
+            warn(
+                "no image centre is given, so the middle of the image, "
+                f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
+            )
         return center
 
 

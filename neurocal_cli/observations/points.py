@@ -288,6 +288,14 @@ class Correspondences:
         """Number of views."""
         return len(self.view_names)
 
+    @property
+    def assumed_centre(self) -> tuple[float, float] | None:
+        """The image centre [px] if it is taken for known: the given one, else the middle of the image."""
+        if self.image_center is not None or self.image_size is None:
+            return self.image_center
+        width, height = self.image_size
+        return (width - 1) / 2, (height - 1) / 2  # pixel centres run from 0 to the size less 1
+
     def place(self, row: int) -> str:
         """Origin of a row, as ``file:line`` or ``points, row 7``."""
         if self.lines is not None:

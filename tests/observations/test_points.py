@@ -101,6 +101,13 @@ def test_what_cannot_be_points_is_refused(given: dict[str, Any], words: str) -> 
     assert "\n" not in str(error.value)
 
 
+def test_the_centre_that_is_assumed_is_the_given_one_or_the_middle_of_the_image() -> None:
+    assert Correspondences(WORLD, PIXELS).assumed_centre is None
+    assert Correspondences(WORLD, PIXELS, image_size=(640, 481)).assumed_centre == (319.5, 240.0)
+    given = Correspondences(WORLD, PIXELS, image_size=(640, 481), image_center=(300.0, 0.0))
+    assert given.assumed_centre == (300.0, 0.0)
+
+
 def test_a_message_names_the_file_and_line() -> None:
     lines = np.arange(10, 10 + N)
     with pytest.raises(InputError, match=r"board\.csv:13: u,v"):

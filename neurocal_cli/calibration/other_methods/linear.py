@@ -67,14 +67,7 @@ def linear(problem: Problem) -> Found:
     """
     if problem.free_distortion:
         raise UsageError("the method linear estimates no distortion; give distortion none, or another method")
-    return Found(*as_seen(problem, linear_state(problem)), minimised=False)
-
-
-def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
-    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
-    if problem.distortion.model == "none" or problem.free_distortion:
-        return problem, state
-    return problem.as_seen(state)
+    return Found(*problem.as_seen(linear_state(problem)), minimised=False)
 
 
 def linear_state(problem: Problem) -> CameraState:

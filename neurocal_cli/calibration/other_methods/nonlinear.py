@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.other_methods.linear import Found, as_seen, linear_state
+from neurocal_cli.calibration.other_methods.linear import Found, linear_state
 from neurocal_cli.camera.distortion import pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -40,7 +40,7 @@ class Minimum:
 
 def nonlinear(problem: Problem) -> Found:
     """Minimise the pixel error from the linear solution, with its errors."""
-    return descend(*as_seen(problem, linear_state(problem)))
+    return descend(*problem.as_seen(linear_state(problem)))
 
 
 def descend(problem: Problem, start: CameraState) -> Found:

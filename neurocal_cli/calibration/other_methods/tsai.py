@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.other_methods.linear import Found, as_seen, smallest, whole_groups
+from neurocal_cli.calibration.other_methods.linear import Found, smallest, whole_groups
 from neurocal_cli.calibration.other_methods.nonlinear import Minimum, least_pixel_error
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
@@ -54,7 +54,7 @@ def tsai(problem: Problem) -> Found:
         raise UsageError("the method tsai estimates poses, which type 4 gives; choose another method")
     if problem.type == 3:
         check_points(problem)
-        return Found(*as_seen(problem, _poses_of_given_camera(problem)), minimised=False)
+        return Found(*problem.as_seen(_poses_of_given_camera(problem)), minimised=False)
     if problem.free_distortion and problem.distortion.model not in _DISTORTIONS:
         raise UsageError(
             f"the method tsai estimates k1 alone; give distortion {' or '.join(_DISTORTIONS)}, or another "
@@ -78,11 +78,9 @@ def with_known_centre(problem: Problem) -> Problem:
     """
     if problem.type in (3, 4):
         return problem
-    entries, points = problem.entries.copy(), problem.points
+    entries = problem.entries.copy()
     if problem.type == 1:
-        centre = points.image_center
-        if centre is None and points.image_size is not None:
-            centre = (points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2
+        centre = problem.points.assumed_centre
         if centre is None:
             raise UsageError(
                 "the method tsai needs the image centre; give type 2 with the centre, or put image_size into "

@@ -24,12 +24,12 @@ from neurocal_cli.calibration.zoom.initialisation import (
     choose_model,
 )
 from neurocal_cli.calibration.zoom.joint_training import (
+    SUSPECT,
     Joint,
     JointLearner,
     assemble,
     contradiction,
     left_out_errors,
-    most_suspect,
     other_unit,
     provisional,
     refuse_gaps,
@@ -162,8 +162,9 @@ def _without_odd(
     """
     rest, odd = start, list[tuple[CalibratedSettings, int]]()
     while len(odd) < _TOGETHER and start.may_reject(len(odd)):
-        suspect = most_suspect(left_out_errors(rest, joints[0]))
-        if suspect is None:
+        pixels = left_out_errors(rest, joints[0])
+        suspect = int(pixels.argmax())
+        if not pixels[suspect] > SUSPECT * np.median(pixels):
             return None
         odd.append((rest, suspect))
         rest = rest.without(suspect)

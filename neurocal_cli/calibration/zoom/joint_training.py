@@ -61,7 +61,7 @@ from neurocal_cli.errors import DegenerateGeometryError, InputError
 # The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
 # out in test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
 # changes sharply is rejected.
-_SUSPECT = 4.0  # times the median cross-validation error; only such settings are examined
+SUSPECT = 4.0  # times the median cross-validation error; only such settings are examined
 
 _SIGMAS = 8.0  # standard deviations from the prediction of all other settings, rms over the parameters
 
@@ -331,12 +331,6 @@ def is_inside(x: Array) -> NDArray[np.bool_]:
     ends = (x == x.min(axis=0)) | (x == x.max(axis=0))
     inside = ~(ends & [len(np.unique(column)) > 2 for column in x.T]).any(axis=1)
     return inside if inside.any() else ~inside
-
-
-def most_suspect(pixels: Array) -> int | None:
-    """The setting that the others predict worst, if far worse than the rest; of (S,) `left_out_errors`."""
-    worst = int(pixels.argmax())
-    return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
 
 
 def contradiction(lens: ZoomLens, start: CalibratedSettings, s: int) -> str | None:

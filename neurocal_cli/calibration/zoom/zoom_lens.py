@@ -23,7 +23,7 @@ from neurocal_cli.calibration.zoom.settings import (
 )
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, euler_jacobian, nearest_rotation
+from neurocal_cli.camera.geometry import Array, euler_jacobian, nearest_rotation, rotation_vector
 from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
@@ -311,10 +311,7 @@ def _mean_constants(constants: list[Constants]) -> tuple[Constants, Array]:
     theta = np.array([c.theta for c in constants])
     t = np.array([c.t for c in constants])
     R = nearest_rotation(np.mean([c.R for c in constants], axis=0))
-    turn = np.array([c.R for c in constants]) @ R.T
-    omega = 0.5 * np.column_stack(
-        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]]
-    )
+    omega = rotation_vector(np.array([c.R for c in constants]) @ R.T)
     mean = Constants(float(theta.mean()), R, t.mean(axis=0))
     return mean, np.column_stack([theta - theta.mean(), omega, t - mean.t])
 
