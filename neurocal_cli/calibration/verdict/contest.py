@@ -28,6 +28,7 @@ from neurocal_cli.calibration.verdict.findings import (
     Finding,
     Limit,
     image_diagonal,
+    log_odds,
     or_else,
 )
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
@@ -286,7 +287,9 @@ def _fitted(lin: Linearised, one: Estimate, n: float) -> Estimate | None:
         for some in groups
     ]
     cost, left = sum(float(fit.cost.sum()) for fit in fits), n * one.noise
-    if not 0 < cost < left:
+    # The other group has a whole camera of its own, of which the rival may have the centre alone.
+    further = max((len(fits) - 1) * len(free) - one.amounts.size, 0)
+    if not (0 < cost < left and (more := log_odds(left, cost, n, further)) > 0):
         return one
     camera, amounts = one.camera, one.amounts
     if len(fits) == 1 and one.rival is not ANOTHER_LENS:
@@ -297,8 +300,8 @@ def _fitted(lin: Linearised, one: Estimate, n: float) -> Estimate | None:
             steps = one.rival.steps_at(lin)[:5]
             amounts = step @ steps / (steps**2).sum(axis=0)
     return replace(
-        one, evidence=one.evidence + 0.5 * n * float(np.log(left / cost)), explained=1.0 - cost / lin.cost,
-        amounts=amounts, camera=camera, noise=cost / n,
+        one, evidence=one.evidence + more, explained=1.0 - cost / lin.cost, amounts=amounts, camera=camera,
+        noise=cost / n,
     )  # fmt: skip
 
 
