@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import Minimum, least_by_precision, quietly
-from neurocal_cli.adjustment.normal_equations import NOTHING
+from neurocal_cli.adjustment.normal_equations import NOTHING, solve_scaled
 from neurocal_cli.calibration.verdict.findings import Cause, Said, in_sequence
 from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -218,8 +218,7 @@ class Known:
     @classmethod
     def of(cls, M: Array, n: float, least: float = 0.0) -> Known:
         """With what noise leaves at least, if that is known."""
-        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M)[:-1], NOTHING))
-        inverse = scale[:, None] * np.linalg.inv(M[:-1, :-1] * np.outer(scale, scale)) * scale
+        inverse = solve_scaled(M[:-1, :-1], np.eye(len(M) - 1), _ROUNDING)  # lenses are almost degenerate
         right = inverse @ M[:-1, -1]
         cost = float(M[-1, -1] - right @ M[:-1, -1])
         return cls(M, n, inverse, right, cost, max(_ROUNDING * cost, least))
