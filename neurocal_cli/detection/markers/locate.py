@@ -30,13 +30,13 @@ from neurocal_cli.detection.markers.numbering import lie_of
 from neurocal_cli.detection.markers.reading import (
     SMALL,
     USUAL,
+    WRONG_BORDER,
     Marks,
     View,
     candidates,
     codes_in,
     looks_at,
     markers_in,
-    numbers_in,
 )
 from neurocal_cli.detection.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
@@ -175,11 +175,16 @@ def _placed(plane: Plane, grey: NDArray[np.uint8], quadrangles: Iterable[Array])
 
 
 def _check_border(plane: TagPlane, grey: NDArray[np.uint8], quadrangles: Iterable[Array]) -> None:
-    """Refuse tags that are read with the other width of the border."""
+    """Refuse tags that are read with the other width of the border, where the board has them."""
     assert plane.markers is not None
-    name, other = plane.markers.dictionary, 3 - plane.border
-    read = [numbers_in(grey, every, name, other) for every in quadrangles if name]
-    if len({number for one in read for number in one.tolist()} - {-1}) >= _ENOUGH:
+    name, other, marks = plane.markers.dictionary, 3 - plane.border, None
+    first, count = plane.markers.first_id, plane.tags[0] * plane.tags[1]
+    for every in quadrangles if name else ():
+        marks = markers_in(grey, every, name, other, first, count, wrong_border=WRONG_BORDER).with_others(
+            marks
+        )
+    placed = None if marks is None else place(replace(plane, border=other), marks)
+    if placed is not None and len(placed.at) >= _ENOUGH:
         cells = "a border of one cell" if plane.border == 2 else "a border of two cells"
         raise NoBoardError(f"the tags have {cells}; say border: {other} in a board file")
 

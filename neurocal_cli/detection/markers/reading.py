@@ -145,7 +145,7 @@ def _detector():  # type: ignore[no-untyped-def]
 
 
 _WITHIN = (-0.25, 0.0, 0.25)  # of a cell, where it is sampled
-_WRONG_BORDER, _ROUGHLY_WRONG = 0.1, 0.3  # greatest share of light cells in a border
+WRONG_BORDER, _ROUGHLY_WRONG = 0.1, 0.3  # greatest share of light cells in a border
 _ROUNDS = 3  # in which a cell's light is compared with that of the cells beside it, which a blur mixes
 _EXTREME = 0.2  # share of the darkest and of the lightest cells that give the levels
 _CONTRAST = 12.0  # DN, least difference of these
@@ -211,11 +211,17 @@ def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, i
 
 
 def markers_in(
-    grey: NDArray[np.uint8], corners: Array, dictionary: str, border: int, first: int, count: int
+    grey: NDArray[np.uint8],
+    corners: Array,
+    dictionary: str,
+    border: int,
+    first: int,
+    count: int,
+    wrong_border: float = _ROUGHLY_WRONG,
 ) -> Marks:
     """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
     H, corners = _framed(grey, corners)
-    which, light = _cells(grey, H, DICTIONARIES[dictionary], border, _ROUGHLY_WRONG)
+    which, light = _cells(grey, H, DICTIONARIES[dictionary], border, wrong_border)
     return _marks(corners[which], light, dictionary, first, count)
 
 
@@ -314,7 +320,7 @@ def _levels(grey: Array) -> tuple[Array, Array]:
 
 
 def _cells(
-    grey: NDArray[np.uint8] | Image, H: Array, bits: int, border: int, wrong_border: float = _WRONG_BORDER
+    grey: NDArray[np.uint8] | Image, H: Array, bits: int, border: int, wrong_border: float = WRONG_BORDER
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Which M of N quadrangles have a dark border, and the light cells (M, bits, bits) in it."""
     side, which, inner = bits + 2 * border, np.arange(len(H)), np.zeros((len(H), bits, bits), dtype=np.bool_)
