@@ -309,7 +309,8 @@ def _framed(grey: NDArray[np.uint8], corners: Array) -> tuple[Array, Array]:
 
 def _sampled(grey: NDArray[np.uint8] | Image, H: Array, places: Array) -> Array:
     """Grey levels (N, K) at places (K, 2) of each quadrangle."""
-    return interpolate(grey, homography_at(H, places[None]))
+    # In single precision, as places are interpolated to a 32nd of a pixel.
+    return interpolate(grey, homography_at(H.astype(np.float32), places[None].astype(np.float32)))
 
 
 def _levels(grey: Array) -> tuple[Array, Array]:
