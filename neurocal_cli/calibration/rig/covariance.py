@@ -44,7 +44,10 @@ from neurocal_cli.adjustment.open_choices import (
     with_stretch,
 )
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.target import Target
 
@@ -173,19 +176,31 @@ def information_of_rig(target: Target, fit: RigFit) -> tuple[Information, Prior]
 
 def with_choice(found: Covariance, fit: RigFit) -> Covariance:
     """Add what the selection of each camera's distortion model leaves open to that of all shared unknowns."""
-    for _, _, arrow, spread, left_out in open_lenses(fit):
-        found = opened(found, np.flatnonzero(fit.free), arrow, spread, left_out)[0]
+    for lens in open_lenses(fit):
+        found = opened(found, np.flatnonzero(fit.free), lens.arrow, lens.spread, lens.left_out)[0]
     return found
 
 
-def open_lenses(
-    fit: RigFit,
-) -> Iterator[tuple[int, OpenCoefficients, Arrowhead, SpreadOfOpen, NDArray[np.bool_]]]:
-    """What the selection of each camera's distortion model leaves open, by the frames of all cameras.
+@frozen_dataclass(eq=False)
+class OpenLens:
+    """What the selection of one camera's distortion model leaves open."""
 
-    These are the camera, its coefficients, the normal equations of the free unknowns with those that its
-    model left out, their spread, and which of all these were left out.
-    """
+    side: int  # which camera
+    coefficients: OpenCoefficients
+    arrow: Arrowhead  # of all free unknowns of the rig, and the coefficients that the model left out
+    left_out: NDArray[np.bool_]  # which of these are such coefficients
+    spread: SpreadOfOpen
+
+    def likelier_than(self, probability: float) -> list[str]:
+        """The names of the open coefficients that are present with a larger probability."""
+        names = np.append(INTRINSIC_NAMES, coefficient_names(self.coefficients.model))
+        is_open = self.coefficients.prior.is_open
+        likely = names[self.coefficients.free][is_open][self.spread.present > probability]
+        return [str(name) for name in likely]
+
+
+def open_lenses(fit: RigFit) -> Iterator[OpenLens]:
+    """What the selection of each camera's distortion model leaves open, by the frames of all cameras."""
     problem, state = fit.problem, fit.state
     lenses: dict[int, OpenCoefficients] = {}
     for side, place in enumerate(state.columns.cameras):
@@ -217,7 +232,7 @@ def open_lenses(
         prior = replace(one.prior, is_open=is_open[with_its], left_out=left_out)
         spread = spread_of_open(arrow, fit.variance / fit.worth, prior)
         if spread is not None:
-            yield side, one, arrow, spread, left_out
+            yield OpenLens(side, one, arrow, left_out, spread)
 
 
 def with_stretch_of(found: Covariance, fit: RigFit) -> tuple[Covariance, float]:

@@ -66,8 +66,7 @@ def fit_rig(
     if outliers == "keep" and left_out:
         told = told_left_out(left_out, problem, names)
         raise DegenerateGeometryError(f"{told}; remove them, or use --outliers reject")
-    if (target := fit.problem.target) is not None:
-        fit = with_board(fit, target)
+    fit = with_board(fit)
     if refine_cameras:
         fit, of_lenses = with_missing_coefficients(fit, names)
         warnings += of_lenses
