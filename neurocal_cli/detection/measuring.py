@@ -108,9 +108,11 @@ def measure(
     if points == "midpoints":
         along = positions_along_edges(grid_image, fitted)
         return (inner if along is None else _measured_both_ways(inner, along)).only(fitted.good)
-    rim, fitted_rim = fit_rim(grid_image, fitted)
-    outer = _midpoints(rim, fitted_rim, fitted.unevenness, vertices)
-    return inner.only(fitted.good).joined_with(outer.only(fitted_rim.good))
+    inner, to_rim = inner.only(fitted.good), fit_rim(grid_image, fitted)
+    if to_rim is None:
+        return inner
+    rim, fitted_rim = to_rim
+    return inner.joined_with(_midpoints(rim, fitted_rim, fitted.unevenness, vertices).only(fitted_rim.good))
 
 
 def _lit(light: NDArray[np.generic], grid: Grid) -> Grid:
@@ -242,9 +244,9 @@ class AlongEdges:
 
 def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges | None:
     """Measure where the outermost mid-points lie along their edges; None if the map is not accurate."""
-    if fitted.map.excess > _AGREES:
+    if fitted.map.excess > _AGREES or (found := fit_rim(grid_image, fitted)) is None:
         return None
-    rim, fit = fit_rim(grid_image, fitted)
+    rim, fit = found
     edges, n = grid_image.edges, len(grid_image.edges.index)
     serves = edges_served(grid_image.grid.shape, edges, rim, fitted.good)
     between, to_rim = (

@@ -18,7 +18,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.detect import Detection, detect_points
-from neurocal_cli.detection.fitting.grid_fit import fit_grid
+from neurocal_cli.detection.fitting.grid_fit import fit_grid, fit_rim
 from neurocal_cli.detection.fitting.map_fit import WideMap
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import GridEdges, GridImage
@@ -128,3 +128,26 @@ def test_paper_boards_are_measured_across_their_edges_only(real_files: RealFiles
     one = detect_points(read_image(path).grey, Board.single(9, 6, 25.0))
     assert len(one.ids) == 93
     assert not len(outermost(one))
+
+
+def test_edges_that_the_map_sends_far_out_of_the_image_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond a board, the map of a wide lens may reach the horizon: edges were a million pixels long."""
+    _, picture = take("base", 0)
+    grid, _ = found(picture.truth.planes[0], 1)
+    grid_image = GridImage(picture.image, grid, 1 / 12)
+    fitted = fit_grid(grid_image)
+    whole = fit_rim(grid_image, fitted)
+    assert whole is not None
+    at = SmoothMap.at
+    least = 0.0
+
+    def folded(self: SmoothMap, place: Array) -> Array:
+        return np.where(place[..., :1] < least, 300.0, 1.0) * at(self, place)
+
+    monkeypatch.setattr(SmoothMap, "at", folded)
+    some = fit_rim(grid_image, fitted)
+    assert some is not None
+    assert len(some[0].index) == len(whole[0].index) - grid.shape[1]
+    least = np.inf
+    assert fit_rim(grid_image, fitted) is None
+    assert positions_along_edges(grid_image, fitted) is None

@@ -342,9 +342,17 @@ def _fitted(
     return fit_batch(edge_model, data, start, prior, shape, STEPS)
 
 
-def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
-    """Fit the edges to the board's rim with the common parameters of all other edges."""
-    edges = GridEdges.of(grid_image.grid, 1)
+def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit] | None:
+    """Fit the edges to the board's rim with the common parameters of all other edges; None if there are none.
+
+    The map of a wide lens may send what lies beyond the board a million pixels away.
+    """
+    edges, size = GridEdges.of(grid_image.grid, 1), np.array(grid_image.size)
+    lines = edges.lines(fitted.map.map)
+    away = np.hypot(*(lines.middle - 0.5 * size).T) + np.abs(lines.ends).max(axis=1)
+    edges = edges.only(away < np.hypot(*size))
+    if not len(edges.index):
+        return None
     lines = edges.lines(fitted.map.map)
     shift = fitted.shifts.terms(lines) @ fitted.map.shift
     fit = _fitted(

@@ -284,6 +284,12 @@ class GridEdges:
         known = np.concatenate([both[which] for both, which in zip(ends, wanted, strict=True)])
         return cls(index.astype(np.int64), vertical, centre, light, known & (not grid.paired))
 
+    def only(self, which: NDArray[np.bool_]) -> GridEdges:
+        """Some of them."""
+        return GridEdges(
+            self.index[which], self.vertical[which], self.centre[which], self.light[which], self.known[which]
+        )
+
     def lines(self, at: SmoothMap) -> Lines:
         """Map the edges to the image."""
         return grid_lines(at, self.centre, self.vertical, self.light)
