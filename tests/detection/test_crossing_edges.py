@@ -18,7 +18,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.detect import Detection, detect_points
-from neurocal_cli.detection.fitting.grid_fit import fit_grid, fit_rim
+from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_grid, fit_rim
 from neurocal_cli.detection.fitting.map_fit import WideMap
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import GridEdges, GridImage
@@ -111,11 +111,14 @@ def test_each_lens_has_a_model_without_a_polynomial(kind: type[SmoothMap]) -> No
     assert kind.models[: kind.richest_lens + 1] == kind.lens_models[: kind.richest_lens + 1]
 
 
-def test_nothing_is_told_of_a_board_that_departs_from_the_map() -> None:
+def plain_board() -> tuple[GridImage, GridFit]:
     _, picture = take("base", 0)
-    grid, _ = found(picture.truth.planes[0], 1)
-    grid_image = GridImage(picture.image, grid, 1 / 12)
-    fitted = fit_grid(grid_image)
+    grid_image = GridImage(picture.image, found(picture.truth.planes[0], 1)[0], 1 / 12)
+    return grid_image, fit_grid(grid_image)
+
+
+def test_nothing_is_told_of_a_board_that_departs_from_the_map() -> None:
+    grid_image, fitted = plain_board()
     along = positions_along_edges(grid_image, fitted)
     assert along is not None
     assert len(along.rows) == len(along.value) > 20
@@ -132,10 +135,7 @@ def test_paper_boards_are_measured_across_their_edges_only(real_files: RealFiles
 
 def test_edges_that_the_map_sends_far_out_of_the_image_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond a board, the map of a wide lens may reach the horizon: edges were a million pixels long."""
-    _, picture = take("base", 0)
-    grid, _ = found(picture.truth.planes[0], 1)
-    grid_image = GridImage(picture.image, grid, 1 / 12)
-    fitted = fit_grid(grid_image)
+    grid_image, fitted = plain_board()
     whole = fit_rim(grid_image, fitted)
     assert whole is not None
     at = SmoothMap.at
@@ -147,7 +147,7 @@ def test_edges_that_the_map_sends_far_out_of_the_image_are_left_out(monkeypatch:
     monkeypatch.setattr(SmoothMap, "at", folded)
     some = fit_rim(grid_image, fitted)
     assert some is not None
-    assert len(some[0].index) == len(whole[0].index) - grid.shape[1]
+    assert len(some[0].index) == len(whole[0].index) - grid_image.grid.shape[1]
     least = np.inf
     assert fit_rim(grid_image, fitted) is None
     assert positions_along_edges(grid_image, fitted) is None

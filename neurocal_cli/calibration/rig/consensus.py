@@ -25,6 +25,7 @@ from neurocal_cli.calibration.calibration import Calibration, ViewResult
 from neurocal_cli.calibration.rig.adjust import rig_problem
 from neurocal_cli.calibration.rig.frames import FrameNames, ViewPairs, frames_of_pairs
 from neurocal_cli.calibration.rig.problem import RigProblem
+from neurocal_cli.calibration.verdict.findings import ROUNDED, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, median, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
@@ -199,11 +200,12 @@ def _of_third(points: Correspondences, place: NDArray[np.intp], is_late: bool) -
 
 
 def _errors_of_views(points: Correspondences, lens: Calibration) -> Array:
-    """(V,) median errors of the views with the poses that fit a camera [px]."""
+    """(V,) median errors of the views with the poses that fit a camera, at least those of rounding [px]."""
     state = fit_poses(points, lens.camera, lens.seed).state(points.view_names)
     off = predicted_pixels(state, points.world, points.view_index)[0] - points.pixels
     errors, view = np.linalg.norm(off, axis=1), points.view_index
-    return np.array([float(median(errors[view == k])) for k in range(points.n_views)])
+    found = np.array([float(median(errors[view == k])) for k in range(points.n_views)])
+    return np.maximum(found, ROUNDED * pixel_spread(points))
 
 
 def _of_pairs(problem: RigProblem, pairs: Sequence[Pair]) -> RigProblem:

@@ -262,15 +262,13 @@ def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
         a, b = edge.cameras
         if edge.is_sound:
             weight[a, b] = weight[b, a] = edge.n_agreed
-            R, t = edge.consensus.rig.R, edge.consensus.rig.t
-            rigs[a, b], rigs[b, a] = edge.consensus.rig, Pose(R.T, -R.T @ t)
+            rigs[a, b], rigs[b, a] = edge.consensus.rig, edge.consensus.rig.inverse
     parts = groups(weight > 0)
     if len(parts) > 1:
         raise DegenerateGeometryError(_why_apart(edges, names, parts))
     found = {0: Pose(np.eye(3), np.zeros(3))}
     for a, b in _tree(weight):
-        before, step = found[a], rigs[a, b]
-        found[b] = Pose(step.R @ before.R, step.R @ before.t + step.t)
+        found[b] = rigs[a, b].after(found[a])
     return [found[k] for k in range(1, len(names))]
 
 

@@ -74,7 +74,7 @@ _TRIED: tuple[tuple[str, str, Callable[[Matches], Matches | None]], ...] = (
      lambda m: replace(m, cameras=[replace(one, distortion=Distortion()) for one in m.cameras])),
     ("the pixels are those of rectified images", _ORIGINALS, _rectified),
     (f"{_CONVENTION} their inverse does", "correct the rig",
-     lambda m: replace(m, pose=Pose(m.pose.R.T, -m.pose.R.T @ m.pose.t))),
+     lambda m: replace(m, pose=m.pose.inverse)),
     (f"{_CONVENTION} -t instead of t does", "correct the rig",
      lambda m: replace(m, pose=Pose(m.pose.R, -m.pose.t))),
     (f"{_CONVENTION} the transposed R does", "correct the rig",

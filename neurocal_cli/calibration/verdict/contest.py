@@ -14,6 +14,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import NEARBY, adjust
 from neurocal_cli.adjustment.board.prior import STRETCH
 from neurocal_cli.adjustment.cross_validation import Minimum
+from neurocal_cli.adjustment.normal_equations import NOTHING
 from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number
 from neurocal_cli.calibration.calibration import Calibration
@@ -202,7 +203,7 @@ def _held(lin: Linearised, worth: float, rivals: tuple[Rival, ...]) -> Contest:
             before = Known.at(at, at.spare).right[: len(before)]
         ranking = estimates(at, at.spare * share, _others(causes, rivals))
     # As an estimated target counts it: all residuals as independent.
-    evidence -= 0.5 * lin.spare * (worth - share) * float(np.log(left))
+    evidence -= 0.5 * lin.spare * (worth - share) * float(np.log(max(left, NOTHING)))
     return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence, n)
 
 

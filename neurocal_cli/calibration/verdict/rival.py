@@ -147,7 +147,7 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
     """The rivals with their most probable patterns, the most probable rival first.
 
     `n` is the effective number of equations beyond the unknowns. Rivals that cannot reach the `least`
-    evidence are left out. Raises `numpy.linalg.LinAlgError` if the views do not determine the camera.
+    evidence are left out. Raises `numpy.linalg.LinAlgError` if the views leave a singular matrix, or nan.
     """
     known = Known.at(lin, n)
     best: dict[str, Estimate] = {}

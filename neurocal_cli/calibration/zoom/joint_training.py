@@ -61,7 +61,8 @@ from neurocal_cli.errors import DegenerateGeometryError, InputError
 # The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
 # out in test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
 # changes sharply is rejected.
-SUSPECT = 4.0  # times the median cross-validation error; only such settings are examined
+SUSPECT = 4.0
+"""Times the median cross-validation error; only such settings are examined."""
 
 _SIGMAS = 8.0  # standard deviations from the prediction of all other settings, rms over the parameters
 

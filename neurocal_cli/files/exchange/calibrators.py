@@ -61,7 +61,7 @@ def _camchain(trees: list[Tree], cameras: CameraSet) -> Tree:
         tree["cam_overlaps"] = [n for n in range(len(trees)) if n != k]
         tree.setdefault("distortion_coeffs", [])
         if k:
-            _STEP.put(tree, cameras.mounted[k].after(cameras.mounted[k - 1].inverse))
+            _STEP.put(tree, cameras.mounted[k].relative_to(cameras.mounted[k - 1]))
     return {f"cam{k}": tree for k, tree in enumerate(trees)}
 
 

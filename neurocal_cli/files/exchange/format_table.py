@@ -316,7 +316,7 @@ class Format(CameraKeys):
         if not others:
             views = {getattr(self.pose, "frame", "body"): pose for pose in known}
         elif len(known) == len(cameras):
-            relative = tuple(pose.after(known[0].inverse) for pose in known[1:])
+            relative = tuple(pose.relative_to(known[0]) for pose in known[1:])
         unit = self.unit(first) if callable(self.unit) else self.unit if poses else None
         return CameraSet(cameras, relative, views, unit, program=self.program)
 

@@ -369,7 +369,7 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
             "ROS or of mrcal, or the file of the rig"
         )
     (frame,) = common
-    pose = right.poses[frame].after(left.poses[frame].inverse)
+    pose = right.poses[frame].relative_to(left.poses[frame])
     return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})
 
 
