@@ -33,7 +33,7 @@ from neurocal_cli.detection.markers.found import (
     marked_beside,
     seen_markers,
 )
-from neurocal_cli.detection.placement import End, NoBoardError, board_ends, fits, size_names
+from neurocal_cli.detection.placement import End, NoBoardError, board_ends, fits, seen_size, size_names
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import found_words
@@ -98,7 +98,7 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
     beside = tuple(_ordered(x.shape) for x, one in zip(whole, near, strict=True) if one)
     behind = tuple(_ordered(x.shape) for x, one in zip(whole, near, strict=True) if not one)
     plain = are_plain(light, foremost.pixels, foremost.dark)
-    return SeenBoard(_ordered(foremost.shape), vote, beside, behind, plain)
+    return SeenBoard(_ordered(seen_size(foremost, ends)), vote, beside, behind, plain)
 
 
 def _is_whole(seen: NDArray[np.bool_]) -> bool:

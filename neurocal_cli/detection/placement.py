@@ -5,7 +5,8 @@ ends, the brightness beyond the ring is the same next to dark and light squares,
 next vertices would be. An occluder, a shadow or the image border cuts the ring at another place, and an
 occluder hides the margin that other sides show. A shadow may begin just at a line of the board. The pattern
 may be seen in it faintly. If not, what lies beyond is dark at one side and light at the others, so that side
-is not taken for an end.
+is not taken for an end. A window on a screen may cut squares beyond the ring: between what is left of them
+and the ring is one more line of vertices, too near to the cut to be measured.
 
 Before that, `trimmed` removes outer lines of a grid that are not lines of the board. False vertices occur
 where a corner of the paper lies near the outer squares, and at corners of squares on a fold.
@@ -52,6 +53,7 @@ class End(Enum):
     BOARD = "the board ends there"
     STOPS = "the pattern stops there: the board ends, or something hides the rest of it"
     PATTERN = "the pattern goes on"
+    CUT = "the pattern goes on, and ends within the next squares"
     OUTSIDE = "outside the image, or behind something before the board"
     UNKNOWN = "hidden or blurred"
 
@@ -69,28 +71,42 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
         for direction, (light, profile, _), (end, margin) in zip(DIRECTIONS, sides, found, strict=True):
             if end in (End.BOARD, End.STOPS) and _is_covered(light, profile, usual):
                 ends[direction] = End.OUTSIDE
+            elif end is End.CUT and not _margin_follows(profile, usual):
+                ends[direction] = End.PATTERN
             elif end is End.BOARD and abs(margin - usual) > _DIFFERENT:
                 ends[direction] = End.STOPS  # before the dark: it may be a shadow
     return ends
 
 
 def _is_covered(light: NDArray[np.bool_], profile: Array, margin: float) -> bool:
-    """Whether something hides the rest: it cuts squares of the ring, or leaves the next ones in part.
+    """Whether something hides the rest: it cuts squares of the ring.
 
-    The margin, which is known from other sides, is not seen. A window on a screen leaves parts of all.
+    The margin, which is known from other sides, is not seen.
     """
-    beyond, past = profile[:, _BEYOND].mean(axis=1), profile[:, _PAST]
+    beyond = profile[:, _BEYOND].mean(axis=1)
     before = _crossings(profile, light.astype(float), beyond) < 1 - _AT_THE_LINE
     cut = before & (np.abs(beyond - light) > _SAME)
-    turned = past[~light].max(axis=0, initial=0) - past[light].min(axis=0, initial=1) > _DIFFERENT
-    some = turned & (np.abs(past - beyond[:, None]) < 0.5 * _SAME).any(axis=0)
     away = np.abs(beyond - margin) > _SAME
-    return bool(away.mean() >= _SHARE and (cut.any() or some.any()))
+    return bool(away.mean() >= _SHARE and cut.any())
+
+
+def _margin_follows(profile: Array, margin: float) -> bool:
+    """Whether the margin that other sides show follows what is left of the next squares."""
+    return bool(((np.abs(profile - margin) < _SAME).mean(axis=0) >= _SHARE)[_STEPS > 1].any())
 
 
 def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
     """Whether the pattern is seen to stop at all sides of a grid."""
-    return len(ends) == len(DIRECTIONS) and not {End.PATTERN, End.OUTSIDE, End.UNKNOWN} & set(ends.values())
+    return len(ends) == len(DIRECTIONS) and set(ends.values()) <= {End.BOARD, End.STOPS}
+
+
+def seen_size(grid: Grid, ends: Mapping[tuple[int, int], End]) -> tuple[int, int]:
+    """Columns and rows of a grid with its lines beside squares that are cut."""
+    cols, rows = (
+        length + sum(end is End.CUT for side, end in ends.items() if side[axis])
+        for axis, length in enumerate(grid.shape)
+    )
+    return cols, rows
 
 
 def _classify(light: NDArray[np.bool_], profile: Array, outside: NDArray[np.bool_]) -> tuple[End, float]:
@@ -109,6 +125,10 @@ def _classify(light: NDArray[np.bool_], profile: Array, outside: NDArray[np.bool
     if light.all() or not light.any():
         return End.UNKNOWN, np.nan
     state, margin = _beyond_ring(light, profile, ring, _BEYOND)
+    if state is not End.PATTERN:
+        for at in _STEPS[_PAST]:
+            if _beyond_ring(light, profile, ring, at == _STEPS)[0] is End.PATTERN:
+                return End.CUT, margin
     if state is End.BOARD and margin < _SAME and _goes_on_in_shadow(light, profile):
         return End.PATTERN, margin
     if state is End.STOPS:  # the margin may be narrow
@@ -292,7 +312,7 @@ def _allowed(
 ) -> bool:
     """Whether a grid's sides lie at the ends of the plane, 0 and `last`, exactly where the board ends."""
     for direction, end in ends.items():
-        if end not in (End.BOARD, End.PATTERN):
+        if end not in (End.BOARD, End.PATTERN, End.CUT):
             continue
         outwards = [a * direction[0] + b * direction[1] for a, b in matrix]
         axis = 0 if outwards[0] else 1
@@ -337,7 +357,7 @@ class NoBoardError(NeurocalError):
 def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) -> NoBoardError:
     """Make the error about a grid that does not fit on the board."""
     wanted = _sizes(board)
-    shape = _in_order(grid.shape, board)
+    shape = _in_order(seen_size(grid, ends), board)
     if len(board.planes) == 1:
         plane = board.planes[0]
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends.values():

@@ -213,10 +213,20 @@ def test_a_board_is_found_beyond_the_border_of_a_shadow(real_files: RealFiles) -
     assert len(detect_points(image, Board.single(9, 7, 25.0), "vertices").ids) >= 34
 
 
-def test_a_window_that_cuts_a_row_of_squares_is_the_end_of_a_board_on_a_screen(real_files: RealFiles) -> None:
+def test_squares_that_a_window_cuts_belong_to_a_board_on_a_screen(real_files: RealFiles) -> None:
+    """At three of its sides, an eighth to a quarter of the outer squares is left."""
     (image,) = map(grey, real_files("photographs/sharpened_screen.jpg"))
-    (located,) = identify(Board.single(9, 6, 25.0), find_grids(image, [(9, 6)]), image).located
+    grids = find_grids(image)
+    found = found_board([image])
+    assert (found.plane.cols, found.plane.rows, found.sure) == (9, 7, False)
+    (located,) = identify(Board.single(9, 7, 25.0), grids, image).located
     assert located.grid.shape == (6, 7)
+    assert {located.placement.apply(np.array([c, r]))[0] for c in (0, 5) for r in (0, 6)} == {1, 7}
+    for cols, rows in ((9, 6), (7, 6)):
+        with pytest.raises(
+            NoBoardError, match=f"detected 9 x 7 inner vertices, but the board has {cols} x {rows}"
+        ):
+            identify(Board.single(cols, rows, 25.0), grids, image)
 
 
 def in_shadow(light: float) -> tuple[np.ndarray, Grid]:
