@@ -29,7 +29,7 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.observability import is_weak
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
-from neurocal_cli.adjustment.residual_correlation import independent_residuals, point_residuals
+from neurocal_cli.adjustment.residual_correlation import independent_residuals
 from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back
 from neurocal_cli.calibration.verdict.findings import log_odds
@@ -74,7 +74,8 @@ def with_more_starts(solution: Solution, more_starts: Starts | None) -> Solution
 def may_lead_lower(solution: Solution, share: float, more_starts: Starts) -> bool:
     """Whether other starts may lead below a share of the squared error; of many views, a few are tried.
 
-    The lens of the solution is fitted from each start, which is the minimum of a lens of its own.
+    The lens of the solution is fitted from each start. That the lens of a start, often a fisheye, fits better
+    by itself does not count, as it is another lens and no other minimum.
     """
     few = of_few_views(solution, _FEW_VIEWS)
     if few is solution or is_elsewhere(few, solution):
@@ -83,11 +84,7 @@ def may_lead_lower(solution: Solution, share: float, more_starts: Starts) -> boo
     from neurocal_cli.calibration.lens_choice.candidate_models import adjusted_to
 
     problem, least = few.problem, share * total_cost(few.adjusted)
-    return any(
-        (point_residuals(problem.views, start) ** 2).sum() < least
-        or total_cost(adjusted_to(problem, start)) < least
-        for start in more_starts(problem)
-    )
+    return any(total_cost(adjusted_to(problem, start)) < least for start in more_starts(problem))
 
 
 def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
