@@ -1,8 +1,8 @@
 """Choose the views that reduce the uncertainty of a camera most, one after the other.
 
-Each view adds the normal matrix of the camera's parameters with the view's pose eliminated, ``A - C B^-1
-C^T``. It needs no observed pixels, so views that were not taken can be compared. All points have equal
-weight, with the noise of the calibration.
+To the covariance of the calibration, each view adds the normal matrix of the camera's parameters with the
+view's pose eliminated, ``A - C B^-1 C^T``. It needs no observed pixels, so views that were not taken can be
+compared. All points have equal weight, with the noise of the calibration.
 
 Changes of the camera that a motion of its frame compensates do not count, as in
 `verdict.measures`. There the frame moves with the poses of the views. Here it moves so that
@@ -12,19 +12,22 @@ view can make the camera less certain, and the numbers of both modules are simil
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.open_choices import open_at_points
 from neurocal_cli.calibration.calibration import Calibration, free_entries
+from neurocal_cli.calibration.measurement import camera_and_root
 from neurocal_cli.calibration.verdict.measures import image_grid
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, by_motion, cross_matrix, euler_to_rotation, nearest_rotation
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.geometry import (
+    Array,
+    by_motion,
+    cross_matrix,
+    euler_to_rotation,
+    median,
+    nearest_rotation,
+)
+from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
 
@@ -34,9 +37,7 @@ _TILTS = ((0.0, 0.0), *((tilt, way) for tilt in (25.0, 45.0) for way in range(0,
 _ROLLS = (0.0, 90.0)  # degrees
 _FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # distances of judged points, relative to that of the views
 _FLAT = 1e-6  # greatest ratio of thickness to size of a flat target
-_LEAST_SIGMA = 1e-4  # px; least noise, for perfect fits
 _MOST_VIEWS = 1000  # each takes time
-_SINGULAR = 1e-13  # eigenvalue of a matrix with unit diagonal, below which it is rounding
 
 
 @frozen_dataclass(eq=False)
@@ -76,10 +77,8 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     options = candidates(calibration)
     if not options:
         raise InputError("no view shows the whole target; check the image size and the target")
-    told = [
-        view_information(known.camera, known.free, option.pose, world, known.square) for option in options
-    ]
-    before, more = known.worst(), np.zeros_like(known.information)
+    told = [known.told(option.pose, world) for option in options]
+    before, more = known.worst(), np.zeros_like(told[0])
     chosen, after = [], []
     for _ in range(count):
         values = [known.worst(more + view) for view in told]
@@ -99,51 +98,38 @@ def refuse_count(count: int) -> None:
 
 @frozen_dataclass(eq=False)
 class _Known:
-    """Information on a camera from the views taken so far."""
+    """What is known of a camera: its errors are sums of f independent ones of standard deviation 1."""
 
-    camera: Camera  # with open coefficients that its model lacks (`open_choices`), as 0
-    free: NDArray[np.bool_]  # (5 + K,) entries of A and coefficients that were estimated, or are open
-    information: Array  # (f, f) normal matrix of the free parameters, with the prior of the open coefficients
-    places: Array  # (g, 2, f) derivatives of the judged pixels, see `pixel_changes`
+    camera: Camera  # with coefficients that the choice of its model leaves open, as 0
+    root: Array  # (5 + K, f) errors of A's entries [px] and the coefficients
+    changes: Array  # (g, 2, f) those of the judged pixels [px], see `pixel_changes`
     sigma: float  # noise of the points [px]
-    square: bool  # whether A22 follows A11
+
+    def told(self, pose: Pose, world: Array) -> Array:
+        """(f, f) information of a view of points (N, 3)."""
+        return self.root.T @ view_information(self.camera, pose, world) @ self.root / self.sigma**2
 
     def worst(self, more: Array | float = 0.0) -> float:
         """Largest standard deviation of a projected pixel [px], with the information of further views."""
-        return worst_std(self.information + more, self.places, self.sigma)
+        left = np.linalg.inv(np.eye(self.root.shape[1]) + more)
+        return float(np.sqrt(((self.changes @ left) * self.changes).sum(axis=(1, 2)).max()))
 
     @classmethod
     def of(cls, calibration: Calibration) -> _Known:
-        points, camera, square = calibration.points, calibration.camera, calibration.square_pixels
-        size = camera.image_size
+        points, size = calibration.points, calibration.image_size
         if not len(points) or not calibration.views:
             raise InputError("the calibration holds no points; give a file that was not written with --lean")
         if size is None:
             raise InputError("the size of the images is unknown; calibrate with --image-size W H")
-        free = free_entries(calibration, NODES)
-        if not camera.intrinsics.skewed:
-            free[1] = False
-        if not free.any():
+        if not free_entries(calibration).any():
             raise InputError("all parameters of the camera are given; more views cannot improve it")
-        rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
-        sigma = max(rms / np.sqrt(2.0), _LEAST_SIGMA)
-        state, tried = calibration.state(points.view_names), tuple(calibration.lens_choice)
-        opened = open_at_points(state, points, free, tried)
-        if opened is not None:
-            camera, free = replace(camera, distortion=Distortion(opened.model, opened.k)), opened.free
-        beforehand = np.zeros(int(free.sum()))
-        if opened is not None:
-            prior = opened.prior
-            beforehand[prior.left_out] = (sigma / prior.size[prior.left_out[prior.is_open]]) ** 2
-        information, depths = np.diag(beforehand), []
-        for k, name in enumerate(points.view_names):
-            pose, own = calibration.views[name].pose, points.world[points.view_index == k]
-            information += view_information(camera, free, pose, own, square)
-            seen = pose.to_camera(own)
-            depth = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
-            depths.append(float(np.median(depth)))
-        places = pixel_changes(camera, free, image_grid(size), _FROM_TO * np.median(depths), square)
-        return cls(camera, free, information, places, sigma, square)
+        camera, root = camera_and_root(calibration, NODES)
+        seen = in_cameras(
+            [calibration.views[name].pose for name in points.view_names], points.world, points.view_index
+        )
+        away = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
+        places = pixel_changes(camera, image_grid(size), _FROM_TO * float(median(away)))
+        return cls(camera, root, places @ root, calibration.sigma)
 
 
 def points_of_target(calibration: Calibration) -> Array:
@@ -215,17 +201,15 @@ def _tilted(tilt: float, way: float) -> Array:
     return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)
 
 
-def view_information(
-    camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array, square: bool = False
-) -> Array:
-    """Information (f, f) of a view of points (N, 3) on the camera.
+def view_information(camera: Camera, pose: Pose, world: Array) -> Array:
+    """Information (5 + K, 5 + K) of a view of points (N, 3) on the camera.
 
-    It is the normal matrix of the free ones of A11, A12, A22, A13, A23 and the coefficients with the pose
-    eliminated, for residuals of unit variance.
+    It is the normal matrix of A11, A12, A22, A13, A23 and the coefficients with the pose eliminated, for
+    residuals of unit variance.
     """
     points = pose.to_camera(world)
-    J, P = _derivatives(camera, free, points, square)
-    return without_pose(J.reshape(-1, J.shape[2]), P.reshape(-1, 6))
+    J, by_point = camera.project_jacobian(points)
+    return without_pose(J.reshape(-1, J.shape[2]), (by_point @ by_motion(points)).reshape(-1, 6))
 
 
 def without_pose(J: Array, P: Array) -> Array:
@@ -234,39 +218,16 @@ def without_pose(J: Array, P: Array) -> Array:
     return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T)
 
 
-def pixel_changes(
-    camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array, square: bool = False
-) -> Array:
-    """Derivatives (g, 2, f) of pixels by the free parameters, without what a motion of the frame compensates.
+def pixel_changes(camera: Camera, pixels: Array, depths: Array) -> Array:
+    """Derivatives (g, 2, 5 + K) of pixels by the camera, without what a motion of its frame compensates.
 
     The pixels (G, 2) are all over the image; those without a ray are left out. Each has a point at each of
     the depths (D,).
     """
     rays = camera.seen_points(pixels)
     rays = rays[np.isfinite(rays[:, 0])]
-    J, P = _derivatives(camera, free, np.concatenate([depth * rays for depth in depths]), square)
+    points = np.concatenate([depth * rays for depth in depths])
+    J, by_point = camera.project_jacobian(points)
+    P = by_point @ by_motion(points)
     motion = np.linalg.lstsq(P.reshape(-1, 6), J.reshape(-1, J.shape[2]), rcond=None)[0]
     return np.asarray(J - P @ motion)
-
-
-def worst_std(normal: Array, changes: Array, sigma: float) -> float:
-    """Largest standard deviation of a projected pixel [px]; infinite if the views determine no camera.
-
-    `normal` (f, f) is the sum of the views' information, `changes` (g, 2, f) are from `pixel_changes`, and
-    `sigma` [px] is the noise of the points, in u and in v.
-    """
-    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
-    S = normal / np.outer(scale, scale)
-    if np.linalg.eigvalsh(S)[0] < _SINGULAR:
-        return float("inf")
-    scaled = changes / scale
-    variance = np.sum((scaled @ np.linalg.inv(S)) * scaled, axis=(1, 2))
-    return sigma * float(np.sqrt(variance.max()))
-
-
-def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array, square: bool) -> tuple[Array, Array]:
-    """Derivatives of pixels by the free parameters (N, 2, f) and a motion of the points' frame (N, 2, 6)."""
-    by_camera, by_point = camera.project_jacobian(points)
-    if square:
-        by_camera[:, :, 0] += by_camera[:, :, 2]
-    return by_camera[:, :, free], by_point @ by_motion(points)

@@ -164,16 +164,9 @@ def _with_root(given: Calibration | Camera) -> tuple[Camera, Array]:
     """A camera and a root (5 + K, f) of the covariance of A's entries [px] and its coefficients."""
     if isinstance(given, Camera):
         return given, np.zeros((5 + len(given.distortion.coefficients), 1))
-    from neurocal_cli.calibration.measurement import camera_and_covariance
+    from neurocal_cli.calibration.measurement import camera_and_root
 
-    camera, covariance = camera_and_covariance(given)
-    if not np.isfinite(covariance).all():
-        raise InputError(
-            "the standard deviations of a camera are unknown, because its points do not determine it; "
-            "calibrate it from more views"
-        )
-    values, vectors = np.linalg.eigh(covariance)
-    return camera, vectors * np.sqrt(np.maximum(values, 0.0))
+    return camera_and_root(given)
 
 
 def _rotation(camera: Camera, rays: Array, pixels: Array, weight: Array, turn: Array) -> tuple[Array, Array]:

@@ -6,6 +6,8 @@ is measured with an error du shows the point X + B^-1 (du - J dc).
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.evidence import evidence_of
 from neurocal_cli.calibration.verdict.measures import image_grid, pixel_covariance
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.given_values import real_rows
 from neurocal_cli.camera.measured import CameraPosition, PlaneErrors, PlanePoints, ProjectedPoints, Spread
@@ -63,6 +66,22 @@ def camera_and_covariance(calibration: Calibration) -> tuple[Camera, Array]:
         whole[2, 2] = whole[0, 0]
     to_pixels = np.array([found.views.pixel_scale] * 5 + [1.0] * (len(m.free) - 5))
     return camera, to_pixels[:, None] * whole * to_pixels
+
+
+def camera_and_root(calibration: Calibration, held: Collection[str] = ()) -> tuple[Camera, Array]:
+    """The camera, and a root (5 + K, f) of `camera_and_covariance`, in which these coefficients are known.
+
+    Raises InputError if the covariance is unknown.
+    """
+    camera, covariance = camera_and_covariance(calibration)
+    if not np.isfinite(covariance).all():
+        raise InputError(
+            "the standard deviations of a camera are unknown, because its points do not determine it; "
+            "calibrate it from more views"
+        )
+    free = ~np.isin(["", "", "", "", "", *coefficient_names(camera.distortion.model)], list(held))
+    values, vectors = np.linalg.eigh(np.where(np.outer(free, free), covariance, 0.0))
+    return camera, vectors[:, values > 0] * np.sqrt(values[values > 0])
 
 
 _STEEPEST = np.cos(np.radians(75.0))  # of the rays of a wide lens that are judged

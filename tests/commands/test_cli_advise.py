@@ -23,7 +23,6 @@ from neurocal_cli.calibration.advice import (
     pixel_changes,
     points_of_target,
     view_information,
-    worst_std,
 )
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.commands.show.advice import advice_report, board_of, draw_advice
@@ -57,7 +56,7 @@ def advised_over_random(seed: int) -> float:
 def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tuple[float, float]:
     """Worst standard deviation of a projected pixel now, and with some more views [px]; see `advise`."""
     known, world = _Known.of(calibration), points_of_target(calibration)
-    told = [view_information(known.camera, known.free, view.pose, world) for view in views]
+    told = [known.told(view.pose, world) for view in views]
     return known.worst(), known.worst(np.sum(told, axis=0))
 
 
@@ -89,23 +88,24 @@ def test_coefficients_that_were_not_chosen_are_uncertain_as_in_the_verdict() -> 
 def test_the_uncertainty_is_that_of_many_calibrations() -> None:
     """The worst std, with a motion of the frame taken out, is the scatter of repeated least squares."""
     camera = Camera(Intrinsics(600, 600, 320, 240), Distortion("k1", [-0.2]), (640, 480))
-    free = np.array([True, False, True, True, True, True])
+    free = [0, 2, 3, 4, 5]
     rng = np.random.default_rng(0)
     world = np.stack([*np.meshgrid(np.arange(6) * 30.0, np.arange(5) * 30.0), np.zeros((5, 6))], -1).reshape(
         -1, 3
     )
-    normal = np.zeros((5, 5))
+    normal = np.zeros((6, 6))
     for _ in range(6):
         pose = Pose.from_euler(*rng.uniform(-0.6, 0.6, 3), np.array([*rng.uniform(-150, 0, 2), 500.0]))
-        normal += view_information(camera, free, pose, world)
+        normal += view_information(camera, pose, world)
     pixels = np.array([[0.0, 0.0], [639, 0], [0, 479], [639, 479], [320, 240]])
-    J = pixel_changes(camera, free, pixels, np.array([250.0, 500.0, 5000.0]))
-    scale = np.sqrt(np.diagonal(normal))
-    L = np.linalg.cholesky(normal / np.outer(scale, scale))
-    drawn = np.linalg.solve(L.T, rng.standard_normal((5, 20000))).T / scale
-    moved = np.einsum("gif,nf->ngi", J, drawn)
+    J = pixel_changes(camera, pixels, np.array([250.0, 500.0, 5000.0]))
+    scale = np.sqrt(np.diagonal(normal)[free])
+    L = np.linalg.cholesky(normal[np.ix_(free, free)] / np.outer(scale, scale))
+    root = np.zeros((6, 5))
+    root[free] = 0.3 * np.linalg.inv(L).T / scale[:, None]
+    moved = np.einsum("gif,nf->ngi", J, rng.standard_normal((20000, 5)) @ root.T)
     scatter = np.sqrt((moved**2).sum(axis=2).mean(axis=0)).max()
-    assert worst_std(normal, J, 0.3) == pytest.approx(0.3 * scatter, rel=0.03)
+    assert _Known(camera, root, J @ root, 0.3).worst() == pytest.approx(scatter, rel=0.03)
 
 
 def test_each_view_helps_and_shows_the_whole_target() -> None:
