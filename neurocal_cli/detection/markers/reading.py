@@ -36,7 +36,7 @@ USUAL = (
     "DICT_APRILTAG_36h10",
     "DICT_ARUCO_MIP_36h12",
 )
-_LONGEST = 2200  # px; larger images are halved first, which still shows the markers of boards
+_LONGEST = 1100  # px; larger images are halved first, which still shows the markers of boards
 SMALL, _ENLARGED = 1000, 3.0  # px; smaller images are enlarged by a factor if markers cannot be read
 _WINDOWS = (5, 29, 8)  # px; least and greatest window of the adaptive threshold, and its step
 _SMALLEST = 6.0  # px, least side of a marker
