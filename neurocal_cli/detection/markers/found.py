@@ -354,9 +354,9 @@ def _spacing(plane: TagPlane, pixels: Array) -> float:
 def _side(picture: _Picture, rough: float, border: float) -> tuple[float, float]:
     """Side of the markers over that of their cells, by the light across their borders, and the blur [cells].
 
-    Both are NaN if unknown.
-
-    `border` is the width of a marker's border over its side.
+    Both are NaN if unknown. Where ink spreads, or light as with gamma, the gap beside a marker becomes wider
+    or narrower at both of its edges. Vertices stay, so that the edge beside the next cell tells the shift of
+    both. `border` is the width of a marker's border over its side.
     """
     pixels, cells, light = picture
     rows, cols = pixels.shape[:2]
@@ -377,16 +377,17 @@ def _side(picture: _Picture, rough: float, border: float) -> tuple[float, float]
     seen = np.median((lights - low) / np.maximum(high - low, 1e-6), axis=0)
 
     def model(x: Array) -> Array:
-        dark, white, offset, begin, sigma = x
-        edge, mark = (0.5 + 0.5 * erf((a - one) / (np.sqrt(2) * sigma)) for one in (offset, begin))
-        misfit = dark + (white - dark) * (edge - mark) - seen
+        dark, white, offset, begin, sigma, light = x
+        places = offset, begin, begin + border * rough
+        edge, mark, code = (0.5 + 0.5 * erf((a - one) / (np.sqrt(2) * sigma)) for one in places)
+        misfit = dark + (white - dark) * (edge - mark + light * code) - seen
         # Of a narrow gap that is blurred, the light does not tell its level and its width apart.
         return np.append(misfit, [3.0 * offset, 0.03 * (white - 1)])
 
     from scipy.optimize import least_squares
     from scipy.special import erf
 
-    start = [0.0, 1.0, 0.0, inset, 0.03]
-    limits = ([-0.5, 0.5, -0.1, 0.01, 0.003], [0.5, 2.0, 0.1, 0.49, 0.3])
+    start = [0.0, 1.0, 0.0, inset, 0.03, 0.5]
+    limits = ([-0.5, 0.5, -0.1, 0.01, 0.003, 0.0], [0.5, 2.0, 0.1, 0.49, 0.3, 1.0])
     fit = least_squares(model, start, bounds=limits)
-    return float(1 - 2 * (fit.x[3] - fit.x[2])), float(fit.x[4])
+    return float(1 - 2 * (fit.x[3] + fit.x[2])), float(fit.x[4])
