@@ -27,8 +27,8 @@ Some = TypeVar("Some", bound="PerFit")
 MEAN, CONTRAST, BLUR = -3, -2, -1
 LEAST_BLUR = 0.2905  # px; the pixel's box alone has sqrt(1/12) = 0.2887
 # Insensitive.
-# The iteration ends when this share of the fits has a last step below so many standard deviations.
-_MOST, _CONVERGED = 0.9, 0.5
+# The iteration ends when this share of the fits expects a further step below so many standard deviations.
+_MOST, _CONVERGED = 0.9, 0.05
 _MORE_STEPS = 20  # greatest number, for fits that have not converged with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
 _FLOAT32 = 1e-6  # relative error of float32 sums
@@ -144,8 +144,8 @@ class BatchFit:
     model: Callable[[Any, Array, ProfileShape], Linearised]
     pixels: FitPixels
     shape: ProfileShape
-    step: Array  # (E,) length of the last step, in standard deviations
-    linear: Linearised  # the model at the values
+    step: Array  # (E,) expected length of a further step, in standard deviations
+    linear: Linearised  # the model at the values, to first order in the last step
     bent: bool = False  # whether the light may be bent within a fit, by more than the model has
 
     @cached_property
@@ -237,7 +237,7 @@ def fit_batch(
     whole = model_of(slice(None))
     state = _State.of(whole, start, prior)
     # A few fits that cannot converge must not delay the others.
-    state.iterate(whole, prior, steps, _MOST)
+    state.iterate(whole, prior, steps, _MOST if more else 1.0)
     unconverged = np.flatnonzero(state.size >= _CONVERGED)
     if len(unconverged) and more:
         part = state.part(unconverged)
@@ -249,7 +249,7 @@ def fit_batch(
 
 @dataclass(eq=False)
 class _State:
-    """State of fits between steps: values, linearised model, products, cost, damping, size of last step."""
+    """State of fits: values, linearised model, products, cost, damping, and size of the last or next step."""
 
     values: Array
     linear: Linearised
@@ -279,9 +279,18 @@ class _State:
     def iterate(
         self, model: Callable[[Array], Linearised], prior: LevelPrior, steps: int, most: float
     ) -> None:
-        """Levenberg-Marquardt steps until a share of the fits has converged."""
+        """Levenberg-Marquardt steps until a share of the fits has converged; the last one is linear."""
         for _ in range(steps):
-            tried = _moved(self.values, self._step(prior))
+            step = self._step(prior)
+            # The model bends along a step in proportion to it, in units of the blur.
+            bend = np.linalg.norm(np.delete(step, [MEAN, CONTRAST], axis=1), axis=1) / self.values[:, BLUR]
+            left = self.size * bend
+            converged = left < _CONVERGED
+            if converged.mean() >= most:
+                self.size = np.where(converged, left, self.size)
+                self._take_last(np.where(converged[:, None], step, 0.0))
+                break
+            tried = _moved(self.values, step)
             ahead = model(tried)
             products = ahead.products(tried.shape[1])
             cost = _cost(products, tried, prior)
@@ -297,8 +306,13 @@ class _State:
                 longer = np.where(self.damping > _LEAST_DAMPING, 0.1 * self.damping, 0.0)
                 self.damping = np.where(worse, shorter, longer)
             self.values, self.linear, self.products, self.cost = tried, ahead, products, cost
-            if (self.size < _CONVERGED).mean() >= most:
-                break
+
+    def _take_last(self, step: Array) -> None:
+        """Take steps (n, P) that are so short that the linearised model tells all that changes."""
+        self.values = _moved(self.values, step)
+        rows, away = self.linear.rows, np.column_stack([np.ones(len(step)), -step])[:, None]
+        rows[:, :1] = away.astype(rows.dtype) @ rows[:, : away.shape[2]]
+        self.products[:, 0, 0] = (away @ self.products @ away.swapaxes(1, 2))[:, 0, 0]
 
     def _step(self, prior: LevelPrior) -> Array:
         """Compute the next step, and set `size` to the length of the undamped step."""

@@ -117,10 +117,11 @@ class PixelNoise:
         return np.reciprocal(variance, out=variance)
 
 
-def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
+def reshaped(fit: BatchFit, good: NDArray[np.bool_]) -> BatchFit:
     """Improve the shape of the profile by linear least squares on the residuals of the good fits.
 
-    Shift, blur and levels are unknowns, too, because they have absorbed a part of the shape.
+    Shift, blur and levels are unknowns, too, because they have absorbed a part of the shape; their changes
+    are those of all fits.
     """
     # A part of the pixels is enough for a dozen unknowns.
     data, shape = fit.pixels, fit.shape
@@ -157,8 +158,14 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     known = np.concatenate([shape.tails.mean(axis=0), shape.nonlinearity])
     right[4:] -= believed * known
     np.einsum("ii->i", normal)[4:] += believed
-    change = np.linalg.solve(normal, right)[4:]
-    return replace(shape, tails=shape.tails + change[:2], nonlinearity=shape.nonlinearity + change[2:])
+    offset, blur, contrast, mean, *change = np.linalg.solve(normal, right).tolist()
+    shape = replace(shape, tails=shape.tails + change[:2], nonlinearity=shape.nonlinearity + change[2:])
+    values = fit.values.copy()
+    values[:, OFFSET] += offset
+    values[:, BLUR] = np.maximum(values[:, BLUR] + blur, LEAST_BLUR)
+    values[:, CONTRAST] *= 1 + contrast
+    values[:, MEAN] += mean
+    return replace(fit, values=values, shape=shape)
 
 
 def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:

@@ -25,7 +25,7 @@ from neurocal_cli.detection.fitting.common_parameters import (
     board_blur,
     board_shading,
     level_prior,
-    profile_shape,
+    reshaped,
     with_gradients,
 )
 from neurocal_cli.detection.fitting.edge_fit import (
@@ -302,7 +302,7 @@ def _fine_fit(
 ) -> tuple[BatchFit, PixelNoise]:
     """Fit edges to all pixels, with levels, blur, profile and noise of the whole board."""
     n = len(first.good)
-    shape = profile_shape(first.fit, first.good)
+    shape = reshaped(first.fit, first.good).shape
     noise = PixelNoise.of(first.fit, grid_image.floor)
     shift = first.shift
     offset = first.map.residual[:n] + shift
@@ -314,9 +314,9 @@ def _fine_fit(
     usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The error of the profile, estimated from a part of the pixels, now dominates: estimate it again.
-        shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
-        fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
+        fit = reshaped(fit, first.good)
+        fit = fit.continued(fit.shape, STEPS, weight=noise.weights(fit.linear.x))
     if shading.has_borders and isinstance(fit.pixels, EdgePixels):
         along = fit.pixels.d, fit.pixels.lever * (0.5 * lines.length).astype(np.float32)[:, None]
         fit = with_gradients(fit, along, of_blur=False, bent=True)

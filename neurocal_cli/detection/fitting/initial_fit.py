@@ -20,7 +20,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
     ProfileShape,
     fit_batch,
 )
-from neurocal_cli.detection.fitting.common_parameters import profile_shape
+from neurocal_cli.detection.fitting.common_parameters import reshaped
 from neurocal_cli.detection.fitting.edge_fit import REACH, SHARP, edge_model, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis, half_widths
 from neurocal_cli.detection.fitting.shading import Shading
@@ -107,7 +107,8 @@ def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFi
         fit = started
         if (shape.half is None) != (fit.shape.half is None):
             fit = fit.continued(shape, _FEW_STEPS, 0)
-        results.append(fit.continued(profile_shape(fit, is_typical(fit, lines.middle)), _STEPS))
+        fit = reshaped(fit, is_typical(fit, lines.middle))
+        results.append(fit.continued(fit.shape, _STEPS))
     smooth, box = (upper_median(results[k].chi2_per_pixel) for k in (0, -1))
     # Prefer the pixel's box if they are about equal, as they are if all edges run along the pixels.
     return results[0] if smooth < _CLEARLY * box else results[-1]
