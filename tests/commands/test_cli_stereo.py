@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import Result
-from support.command_line import run
+from support.command_line import refused, run
 from support.real_data import RealFiles
 from support.rigs import RigScene, random_rig
 from support.slow_cases import slow_but
@@ -146,28 +146,19 @@ def test_it_takes_calibrates_options() -> None:
     assert one - two == {"points", "intrinsics", "extrinsics", "camera_name"}
 
 
-def error(result: Result, *parts: str) -> None:
-    assert result.exit_code == 1
-    assert result.stdout == ""
-    last = result.stderr.splitlines()[-1]
-    assert last.startswith("Error: ")
-    for part in parts:
-        assert part in last
-
-
 def test_files_that_do_not_go_together_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
-    error(run("stereo", *files[::-1]), "swapped", "give the left camera first")
-    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras are at the same place")
+    refused(run("stereo", *files[::-1]), "swapped", "give the left camera first")
+    refused(run("stereo", files[0], files[0], "--no-skew"), "both cameras are at the same place")
     right = points()[1]
     write_points(replace(right, unit="cm"), tmp_path / "r.csv")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "is in mm", "in cm")
+    refused(run("stereo", files[0], tmp_path / "r.csv"), "is in mm", "in cm")
     write_points(replace(right, world=right.world / 10), tmp_path / "r.csv")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "in the same coordinates and unit")
+    refused(run("stereo", files[0], tmp_path / "r.csv"), "in the same coordinates and unit")
     write_points(replace(right, view=[f"b{v}" for v in right.view]), tmp_path / "r.csv")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has a partner")
+    refused(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has a partner")
     (tmp_path / "r.csv").write_text("")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "is empty")
-    error(run("stereo", files[0], tmp_path / "none.csv"), "there is no such file")
+    refused(run("stereo", files[0], tmp_path / "r.csv"), "is empty")
+    refused(run("stereo", files[0], tmp_path / "none.csv"), "there is no such file")
 
 
 def test_a_flipped_pair_is_named_and_left_out_or_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
@@ -179,7 +170,7 @@ def test_a_flipped_pair_is_named_and_left_out_or_refused(files: tuple[Path, Path
     result = run(
         "stereo", files[0], tmp_path / "r.csv", "--no-skew", "--outliers", "keep", "-o", tmp_path / "rig"
     )
-    error(result, "left03/right03: the target is turned by 180 degrees", "--outliers reject")
+    refused(result, "left03/right03: the target is turned by 180 degrees", "--outliers reject")
     assert not (tmp_path / "rig").exists()
 
 

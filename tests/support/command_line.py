@@ -20,6 +20,15 @@ def run(*words: object, stdin: bytes | None = None, env: dict[str, str] | None =
     return runner.invoke(neurocal, [str(word) for word in words], input=stdin, env=env, prog_name="neurocal")
 
 
+def refused(result: Result, *parts: str) -> None:
+    """Check that a command failed with nothing on stdout, and an error of one line that has these parts."""
+    assert (result.exit_code, result.stdout) == (1, "")
+    last = result.stderr.splitlines()[-1]
+    assert last.startswith("Error: ")
+    for part in parts:
+        assert part in last
+
+
 def commands() -> Iterator[tuple[list[str], click.Command]]:
     """Every command that a user sees, with the words that call it."""
 
