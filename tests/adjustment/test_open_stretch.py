@@ -10,6 +10,7 @@ from support.campaign import scene
 from support.rigs import corner, random_rig, stereo_problem
 from support.scenes import random_rotation
 from support.targets import photographed
+from support.verdicts import verdict_on
 
 from neurocal_cli import calibrate
 from neurocal_cli.adjustment import open_choices
@@ -44,9 +45,7 @@ def test_a_stretch_that_noise_hides_is_in_the_standard_deviations(seed: int, nam
     assert all(chosen.std[name] >= by_name.std[name] for name in chosen.std)
     pairs = [(chosen.views[name].std, by_name.views[name].std) for name in chosen.views]
     assert all(more[name] >= less[name] for more, less in pairs for name in more)
-    assert chosen.verdict is not None
-    assert by_name.verdict is not None
-    assert chosen.verdict.measures["projection_px"] > by_name.verdict.measures["projection_px"]
+    assert verdict_on(chosen).measures["projection_px"] > verdict_on(by_name).measures["projection_px"]
 
 
 def only(which: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.slow_cases import slow_but
 from support.targets import SHAPES, board, offsets, photographed, placed_translations, views_of
+from support.verdicts import verdict_on
 
 from neurocal_cli import Camera, Intrinsics, calibrate
 from neurocal_cli.adjustment.adjust import Adjusted
@@ -228,8 +229,7 @@ def test_the_camera_and_the_board_are_found_together(shape: str, amount: float) 
     assert np.abs(z).max() < 4
     assert np.abs(errors(found, truth.K)).max() < 0.4 * np.abs(errors(given, truth.K)).max()
     assert shape_error(found, truth.found) < 0.25 * shape_error_of_given(truth.found)
-    assert found.verdict is not None
-    assert found.verdict.word == "good"
+    assert verdict_on(found).word == "good"
 
 
 def shape_error_of_given(true: np.ndarray) -> float:
@@ -271,8 +271,7 @@ def test_what_is_no_shape_is_not_taken_for_one() -> None:
     swapped[10::63], swapped[11::63] = swapped[11::63].copy(), swapped[10::63].copy()
     kept = calibrate(replace(points, world=points.world[swapped]), outliers="keep", distortion="k1k2")
     assert kept.target is None
-    assert kept.verdict is not None
-    assert kept.verdict.word == "poor"
+    assert verdict_on(kept).word == "poor"
 
 
 @pytest.mark.slow
@@ -282,9 +281,8 @@ def test_a_wrong_square_is_measured_and_told() -> None:
     assert found.target is not None
     assert found.target.stretch() == pytest.approx(0.06, abs=0.001)
     assert np.abs(errors(found, truth.K) / [found.std[name] for name in PARAMETERS]).max() < 4
-    assert found.verdict is not None
-    assert found.verdict.word == "poor"
-    assert "the target is 6 % longer along X, compared with Y" in found.verdict.reasons[0]
+    assert verdict_on(found).word == "poor"
+    assert "the target is 6 % longer along X, compared with Y" in verdict_on(found).reasons[0]
 
 
 # A bent board that was found in its place was good, with the focal length five standard deviations off.
@@ -293,10 +291,9 @@ def test_a_distortion_that_is_too_simple_is_not_taken_for_a_shape(seed: int, n_v
     points, _ = photographed("flat", seed, n_views, k=(k1,), model="k1")
     found = calibrate(points, distortion="none")
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
-    assert any("the distortion model is too simple" in reason for reason in found.verdict.reasons)
-    assert "auto" in " ".join(found.verdict.advice)
+    assert verdict_on(found).word != "good"
+    assert any("the distortion model is too simple" in reason for reason in verdict_on(found).reasons)
+    assert "auto" in " ".join(verdict_on(found).advice)
 
 
 # The error is only 8 % larger without p1 and p2, but the centre is off by six standard deviations.
@@ -305,9 +302,8 @@ def test_missing_tangential_coefficients_are_named() -> None:
     found = calibrate(points, distortion="k1k2")
     assert abs(found.intrinsics.v0 - truth.K[1, 2]) > 5 * found.std["v0"]
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word == "poor"  # as a cause that biases the centre by more than five std is named
-    assert any("too simple: k1k2p1p2" in reason for reason in found.verdict.reasons)
+    assert verdict_on(found).word == "poor"  # a cause that biases the centre by more than five std is named
+    assert any("too simple: k1k2p1p2" in reason for reason in verdict_on(found).reasons)
 
 
 # The error is that of noise, and the centre is off by six standard deviations.
@@ -315,9 +311,8 @@ def test_a_named_lens_without_p1_and_p2_is_usable_where_the_points_leave_these_o
     points, truth = photographed("flat", 1041, 5, k=(-0.1, 0.03, 4e-4, -4e-4), model="k1k2p1p2")
     found = calibrate(points, distortion="k1k2")
     assert abs(found.intrinsics.v0 - truth.K[1, 2]) > 5 * found.std["v0"]
-    assert found.verdict is not None
-    assert found.verdict.word == "usable"
-    assert "p1 and p2" in found.verdict.reasons[0]
+    assert verdict_on(found).word == "usable"
+    assert "p1 and p2" in verdict_on(found).reasons[0]
     selected = calibrate(points)
     for name, true in (("u0", truth.K[0, 2]), ("v0", truth.K[1, 2])):
         assert abs(getattr(selected.intrinsics, name) - true) < 3 * selected.std[name]
@@ -337,8 +332,7 @@ def test_of_models_that_are_too_simple_few_are_good_and_wrong(named: str, model:
         points, truth = photographed("flat", seed, (3, 5, 8, 15)[seed % 4], k=k, model=model)
         found = calibrate(points, distortion=named)
         std = np.array([found.std[name] for name in PARAMETERS])
-        assert found.verdict is not None
-        wrong += found.verdict.word == "good" and bool((np.abs(errors(found, truth.K)) > 4 * std).any())
+        wrong += verdict_on(found).word == "good" and bool((np.abs(errors(found, truth.K)) > 4 * std).any())
     assert wrong <= most
 
 
@@ -358,16 +352,14 @@ def test_a_distortion_that_is_rich_enough_is_not_called_too_simple(
 ) -> None:
     points, _ = photographed("flat", seed, n_views, k=k, model=model)
     found = calibrate(points, distortion=model)
-    assert found.verdict is not None
-    assert not any("too simple" in reason for reason in found.verdict.reasons)
+    assert not any("too simple" in reason for reason in verdict_on(found).reasons)
 
 
 def test_a_bent_board_is_found_with_a_distortion_that_is_rich_enough() -> None:
     points, truth = photographed("parabola", 12, 9, k=(-0.2,), model="k1")
     found = calibrate(points, distortion="k1")
     assert found.target is not None
-    assert found.verdict is not None
-    assert not any("too simple" in reason for reason in found.verdict.reasons)
+    assert not any("too simple" in reason for reason in verdict_on(found).reasons)
     assert np.abs(errors(found, truth.K) / [found.std[name] for name in PARAMETERS]).max() < 4
 
 
@@ -514,8 +506,6 @@ def test_plumb_line_says_that_the_board_is_bent() -> None:
     points, _ = photographed("parabola", 0, 8)
     found = calibrate(points, distortion="plumb-line", skew=False)
     assert found.target is None
-    assert found.verdict is not None
-    assert any("it seems bent by 0." in text for text in found.verdict.reasons)
+    assert any("it seems bent by 0." in text for text in verdict_on(found).reasons)
     flat = calibrate(photographed("flat", 0, 8)[0], distortion="plumb-line", skew=False)
-    assert flat.verdict is not None
-    assert not any("bent" in text for text in flat.verdict.reasons)
+    assert not any("bent" in text for text in verdict_on(flat).reasons)

@@ -9,6 +9,7 @@ import pytest
 from support.campaign import CONDITIONS, Array, noise_of_neighbours, scene
 from support.campaign_reference import reference
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 
 from neurocal_cli import Pose, calibrate
 from neurocal_cli.errors import DegenerateGeometryError
@@ -27,9 +28,8 @@ def judge(seed: int) -> tuple[str, str]:
         return truth.condition, "refused" if known.share < RESOLVED else ""
     if known.excess(found) > WRONG_MINIMUM:
         return truth.condition, "wrong minimum"
-    assert found.verdict is not None
     off = abs(found.K[0, 0] - truth.A[0, 0]) / found.std["alpha_u"]
-    return truth.condition, "good" if found.verdict.word == "good" and off > 5 else ""
+    return truth.condition, "good" if verdict_on(found).word == "good" and off > 5 else ""
 
 
 @pytest.mark.parametrize("seed", slow_but((5007,), range(5007, 5014)))
@@ -83,8 +83,7 @@ def false_alarms(seeds: range) -> int:
     for seed in seeds:
         points, truth = scene(seed, midpoints=True)
         found = calibrate(points)
-        verdict = found.verdict
-        assert verdict is not None
+        verdict = verdict_on(found)
         off = abs(found.K[0, 0] - truth.A[0, 0]) / found.std["alpha_u"]
         assert verdict.word != "good" or off < 5, (seed, off)
         count += any(not any(weak in reason for weak in WEAK) for reason in verdict.reasons)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.command_line import run
+from support.verdicts import verdict_on
 from support.wrong_inputs import CAMERA, flat
 
 from neurocal_cli import calibrate, calibrate_rig, calibrate_stereo, read_calibration, read_points
@@ -32,8 +33,7 @@ def test_a_fixed_parameter_stays_and_the_others_are_the_better_for_it(name: str)
     for other in {"alpha_u", "alpha_v", "u0", "v0"} - {name}:
         assert abs(getattr(found.intrinsics, other) - getattr(CAMERA, other)) < 5 * found.std[other]
         assert found.std[other] < 1.1 * free.std[other]
-    assert found.verdict is not None
-    assert found.verdict.word == "good"
+    assert verdict_on(found).word == "good"
 
 
 def test_both_coordinates_of_the_centre_are_type_2() -> None:
@@ -56,9 +56,8 @@ def test_fewer_views_do_if_more_is_known() -> None:
 def test_a_value_that_the_points_contradict_is_named(name: str, off: float) -> None:
     wrong = float(getattr(CAMERA, name)) + off
     found = calibrate(flat(6), skew=False, fix={name: wrong}, **KNOWN)
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
-    assert any(f"{name} = {wrong:g} is given" in reason for reason in found.verdict.reasons)
+    assert verdict_on(found).word != "good"
+    assert any(f"{name} = {wrong:g} is given" in reason for reason in verdict_on(found).reasons)
 
 
 def test_coefficients_stay_at_their_values() -> None:

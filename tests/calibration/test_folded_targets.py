@@ -10,6 +10,7 @@ import pytest
 from support.folded import Folded, folded, random_corner
 from support.rigs import corner
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.adjustment.board.prior import gauge_of, nearest_to_given
@@ -88,9 +89,8 @@ def test_std_of_one_view_hold(type: int, size: float, planes: int) -> None:
         target = folded(rng, size, planes=planes)
         points = target.seen(0, 0.1, rng)
         found = calibrate(points, type=type, distortion="none", **given_of(type, target))
-        assert found.verdict is not None
         own = off(found, target)
-        assert not (found.verdict.word == "good" and np.abs(own).max() > 5)
+        assert not (verdict_on(found).word == "good" and np.abs(own).max() > 5)
         values += own
         words.append(found.target is not None)
     assert np.mean(words) > 0.7
@@ -167,8 +167,7 @@ def test_one_photograph_of_a_bent_corner_through_a_lens_gives_the_camera() -> No
         target = folded(rng, 0.5, bend=0.3, lens="k1k2")
         found = calibrate(target.seen(0, 0.1, rng))
         values += off(found, target)
-        assert found.verdict is not None
-        assert not (found.verdict.word == "good" and np.abs(off(found, target)).max() > 5)
+        assert not (verdict_on(found).word == "good" and np.abs(off(found, target)).max() > 5)
     assert 0.4 < rms(values) < 1.25
 
 
@@ -182,8 +181,7 @@ def test_one_photograph_of_any_corner(seeds: range) -> None:
     for seed in seeds:
         scene = random_corner(seed)
         found = calibrate(scene.points, skew=False)
-        assert found.verdict is not None
-        assert not (found.verdict.word == "good" and np.abs(scene.off(found)).max() > 5)
+        assert not (verdict_on(found).word == "good" and np.abs(scene.off(found)).max() > 5)
         values += scene.off(found).tolist()
     assert rms(values) < 1.2
 
@@ -221,8 +219,7 @@ def test_a_lens_that_is_named_and_too_simple_is_not_taken_for_bent_planes() -> N
     target = folded(rng, 0.0, lens="k1k2")
     found = calibrate(target.seen(0, 0.1, rng), distortion="none")
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
+    assert verdict_on(found).word != "good"
 
 
 def last_plane(change: Callable[[Array], Array]) -> Callable[[Array], Array]:
@@ -259,8 +256,7 @@ def test_a_plane_whose_points_are_wrong_is_not_taken_for_one_that_stands_elsewhe
             found = calibrate(replace(points, world=WRONG[wrong](points.world)), distortion="none")
         except NeurocalError:
             continue
-        assert found.verdict is not None
-        assert found.verdict.word != "good"
+        assert verdict_on(found).word != "good"
 
 
 def test_the_summary_says_how_far_the_planes_are_off() -> None:

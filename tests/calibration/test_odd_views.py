@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 from support.wrong_inputs import flat, in_views, moved, of_cameras
 
 from neurocal_cli import Correspondences, NeurocalError, calibrate
@@ -39,15 +40,13 @@ def test_what_is_wrong_with_a_view_is_named(points: Correspondences, said: str) 
 def test_a_view_whose_sigma_is_too_small_is_named_and_kept() -> None:
     found = calibrate(with_sigma(np.where(ONE[:, 0], 0.02, 0.2)))
     assert found.n_rejected == 0
-    assert found.verdict is not None
-    assert found.verdict.reasons[0] == "view03: the stated sigma is 11 times too small"
+    assert verdict_on(found).reasons[0] == "view03: the stated sigma is 11 times too small"
 
 
 def test_points_whose_sigma_is_too_small_are_no_outliers() -> None:
     found = calibrate(with_sigma(0.2 * 10 ** np.random.default_rng(5).uniform(-1, 1, len(POINTS))))
     assert found.n_rejected < 10
-    assert found.verdict is not None
-    assert "the stated sigmas do not predict the residuals" in found.verdict.reasons
+    assert "the stated sigmas do not predict the residuals" in verdict_on(found).reasons
 
 
 @pytest.mark.parametrize("by_view", slow_but((False,), (True, False)))
@@ -61,15 +60,13 @@ def test_sigmas_that_hold_are_not_blamed(by_view: bool) -> None:
         noisy = moved(
             with_sigma(np.hypot(stated, 0.2)), pixels=exact + stated[:, None] * rng.normal(size=(930, 2))
         )
-        verdict = calibrate(noisy).verdict
-        assert verdict is not None
+        verdict = verdict_on(calibrate(noisy))
         assert not any("sigma" in reason for reason in verdict.reasons)
 
 
 def test_residuals_that_differ_by_direction_or_view_are_named() -> None:
     blurred = POINTS.pixels + [1, 0] * RNG.normal(size=(930, 1))
-    verdict = calibrate(moved(POINTS, pixels=blurred), distortion="none").verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(moved(POINTS, pixels=blurred), distortion="none"))
     assert any(
         "the residuals along u are" in reason and "motion blur" in reason for reason in verdict.reasons
     )

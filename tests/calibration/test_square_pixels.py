@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.command_line import run
+from support.verdicts import verdict_on
 from support.wrong_inputs import CAMERA, flat
 
 from neurocal_cli import calibrate, calibrate_rig, calibrate_stereo, read_calibration, read_points
@@ -76,9 +77,7 @@ def test_every_lens_and_type_can_have_square_pixels(
     assert again.square_pixels
     assert again.std == found.std
     np.testing.assert_array_equal(again.covariance, found.covariance)
-    assert again.verdict is not None
-    assert found.verdict is not None
-    assert again.verdict.word == found.verdict.word
+    assert verdict_on(again).word == verdict_on(found).word
 
 
 def test_a_given_alpha_is_that_of_both_axes() -> None:
@@ -93,8 +92,7 @@ def test_pixels_that_are_not_square_are_told_or_make_no_difference() -> None:
     points = flat(6)
     pixels = points.pixels * [1.0, 1.03]
     found = calibrate(replace(points, pixels=pixels), square_pixels=True, **KNOWN)
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
+    assert verdict_on(found).word != "good"
 
 
 @pytest.mark.parametrize(

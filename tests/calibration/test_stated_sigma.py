@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 from support.wrong_inputs import CAMERA, bent_board, board, flat, poses, seen, with_sigma
 
 from neurocal_cli import Correspondences, calibrate
@@ -26,8 +27,7 @@ def few(n: int, share: float, seed: int) -> np.ndarray:
 
 
 def reasons(points: Correspondences) -> tuple[str, ...]:
-    verdict = calibrate(points).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(points))
     return verdict.reasons
 
 
@@ -75,8 +75,7 @@ def test_points_that_are_as_uncertain_as_they_say_are_no_outliers() -> None:
     noisy[wrong] += 8.0
     found = calibrate(with_sigma(replace(exact, pixels=noisy), sigma))
     assert sorted(found.rejected.rows) == np.flatnonzero(wrong).tolist()
-    assert found.verdict is not None
-    assert not any("sigma" in reason for reason in found.verdict.reasons)
+    assert not any("sigma" in reason for reason in verdict_on(found).reasons)
 
 
 def test_a_bent_board_is_no_wrong_sigma() -> None:

@@ -12,6 +12,7 @@ from support.command_line import run
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.surveyed import K, surveyed
+from support.verdicts import verdict_on
 
 from neurocal_cli import calibrate, read_calibration, read_points
 from neurocal_cli.adjustment.board import system as system_module
@@ -101,9 +102,8 @@ def test_a_survey_that_is_wrong_about_itself_is_told_so_and_does_no_harm(stated:
     right = calibrate(surveyed(3)[0], **OPTIONS)
     wrong = calibrate(surveyed(3, stated=stated)[0], **OPTIONS)
     assert wrong.std["alpha_u"] == pytest.approx(right.std["alpha_u"], rel=0.1)
-    assert wrong.verdict is not None
-    assert wrong.verdict.word == "usable"
-    (reason,) = [text for text in wrong.verdict.reasons if text.endswith("to match the residuals")]
+    assert verdict_on(wrong).word == "usable"
+    (reason,) = [text for text in verdict_on(wrong).reasons if text.endswith("to match the residuals")]
     times, size = re.search(r"points are ([0-9.]+) times too (\w+)", reason).groups()
     assert size == said
     assert 8 < float(times) < 12.5
@@ -111,8 +111,7 @@ def test_a_survey_that_is_wrong_about_itself_is_told_so_and_does_no_harm(stated:
 
 def test_points_that_take_in_all_of_the_error_are_told(real_files: RealFiles) -> None:
     found = calibrate(read_points(real_files("field_reports/lidars1.csv")[0]))
-    assert found.verdict is not None
-    assert "with the points as stated it is 4.17 px rms" in found.verdict.reasons[0]
+    assert "with the points as stated it is 4.17 px rms" in verdict_on(found).reasons[0]
 
 
 @pytest.mark.parametrize("seed", [20, 27])

@@ -10,6 +10,7 @@ import pytest
 from support.many_cameras import SIGMA, errors_over_std, joined, moved, of_frames, scene, steady
 from support.rigs import all_residuals
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 
 from neurocal_cli import Camera, Intrinsics, Pose, calibrate, calibrate_stereo
 from neurocal_cli.adjustment.reprojection import normal_blocks
@@ -156,8 +157,7 @@ def test_few_clean_rigs_are_accused() -> None:
     for seed in range(60):
         _, points = scene(("ring", "line", "star")[seed % 3], 6 + seed % 3, 60, seed=400 + seed)
         rig = calibrate_rig(points, skew=False)
-        verdict = rig.verdict
-        assert verdict is not None
+        verdict = verdict_on(rig)
         accused += bool(rig.views_left_out) or any(
             "camera cam" in why or "later" in why for why in verdict.reasons
         )
@@ -199,9 +199,8 @@ def test_two_fisheyes_back_to_back_share_what_is_beside_both() -> None:
     truth = SimulatedRig({"left": camera, "right": camera}, mounted, board, frames)
     pair = calibrate_stereo(*truth.points(0.2, rng).values(), skew=False)
     assert np.abs(errors_over_std(pair, truth)).max() < 4.5
-    assert pair.verdict is not None
-    assert pair.verdict.word == "good"
-    assert 0 < pair.verdict.measures["depth_share"] < 0.005
+    assert verdict_on(pair).word == "good"
+    assert 0 < verdict_on(pair).measures["depth_share"] < 0.005
     assert not any("swapped" in warning for warning in pair.warnings)
 
 
@@ -243,9 +242,8 @@ def test_a_camera_that_moved_is_named_and_its_larger_part_kept(at: int) -> None:
     points["cam2"] = joined(of_frames(points["cam2"], lambda k: k < at), of_frames(other, lambda k: k >= at))
     rig = calibrate_rig(points, skew=False)
     assert {camera for camera, _ in rig.views_left_out} == {"cam2"}
-    assert rig.verdict is not None
-    assert rig.verdict.word == "poor"
-    assert any("camera cam2 moved between" in why for why in rig.verdict.reasons)
+    assert verdict_on(rig).word == "poor"
+    assert any("camera cam2 moved between" in why for why in verdict_on(rig).reasons)
 
 
 def test_a_camera_that_moved_is_named_beside_many_that_did_not() -> None:
@@ -255,9 +253,8 @@ def test_a_camera_that_moved_is_named_beside_many_that_did_not() -> None:
     points, then = rig.points(0.1, rng), moved(rig, "cam3", 2.0, 0.0).points(0.1, rng)["cam3"]
     points["cam3"] = joined(of_frames(points["cam3"], lambda k: k < 10), of_frames(then, lambda k: k >= 10))
     found = calibrate_rig(points, skew=False, target="given", distortion="k1k2")
-    assert found.verdict is not None
-    assert found.verdict.word == "poor"
-    assert "camera cam3 moved between 009 and 010" in found.verdict.reasons[0]
+    assert verdict_on(found).word == "poor"
+    assert "camera cam3 moved between 009 and 010" in verdict_on(found).reasons[0]
     assert set(found.views_left_out) == {("cam3", f"{k:03d}") for k in range(10, 16)}
 
 
@@ -289,8 +286,7 @@ def test_views_that_are_each_wrong_by_themselves_are_no_camera_that_moved() -> N
         points["cam3"] = joined(rest, of_frames(then, lambda frame, k=k: frame == k))
     found = calibrate_rig(points, skew=False, target="given", distortion="k1k2")
     assert {camera for camera, _ in found.views_left_out} == {"cam3"}
-    assert found.verdict is not None
-    assert not any("moved" in why for why in found.verdict.reasons)
+    assert not any("moved" in why for why in verdict_on(found).reasons)
 
 
 def test_a_camera_that_is_late_is_found_and_compensated() -> None:
@@ -309,10 +305,9 @@ def test_a_camera_that_is_late_is_found_and_compensated() -> None:
     assert std < 0.01
     assert found.rmse_px < 0.45
     assert np.abs(errors_over_std(found, rig)).max() < 4.5
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
+    assert verdict_on(found).word != "good"
     assert any(
-        "cam1 were taken later by 0.4 of the time between frames" in why for why in found.verdict.reasons
+        "cam1 were taken later by 0.4 of the time between frames" in why for why in verdict_on(found).reasons
     )
 
 
@@ -346,11 +341,10 @@ def test_a_target_of_another_size_in_one_camera_is_named() -> None:
     for factor, smaller in ((1.03, r"2\.[6789]"), (1.5, r"\d\d")):
         wrong = {**points, "cam3": replace(points["cam3"], world=points["cam3"].world * factor)}
         rig = calibrate_rig(wrong, skew=False)
-        assert rig.verdict is not None
-        assert rig.verdict.word == "poor"
+        assert verdict_on(rig).word == "poor"
         assert any(
             re.search(f"the target of camera cam3 is {smaller} % smaller than its X,Y,Z say", why)
-            for why in rig.verdict.reasons
+            for why in verdict_on(rig).reasons
         )
 
 
@@ -464,8 +458,7 @@ def test_a_shape_of_the_target_is_what_all_cameras_say() -> None:
         points = truth.points(
             SIGMA, np.random.default_rng(5), shape=lambda at, by=longer: at * [1 + by, 1, 1]
         )
-        verdict = calibrate_rig(points, skew=False, target="given").verdict
-        assert verdict is not None
+        verdict = verdict_on(calibrate_rig(points, skew=False, target="given"))
         assert any("it seems longer by" in reason for reason in verdict.reasons) == is_told
         assert (verdict.word == "good") != is_told
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.many_cameras import moved, scene
+from support.verdicts import verdict_on
 
 from neurocal_cli import calibrate_rig, evaluate_rig, triangulate, triangulate_many
 from neurocal_cli.camera.geometry import Array
@@ -143,9 +144,7 @@ def test_a_rig_is_evaluated_on_its_own_and_on_new_points() -> None:
     assert other.rig is not None
     assert other.rig.rmse < 9
     assert other.predicted["cam1"][0] == 0
-    assert other.verdict is not None
-    assert rig.verdict is not None
-    assert other.verdict.word == rig.verdict.word
+    assert verdict_on(other).word == verdict_on(rig).word
     turned = moved(truth, "cam2", 1.0, 0.0).points(0.3, np.random.default_rng(99))
     changed = evaluate_rig(rig, turned).verdict
     assert changed is not None

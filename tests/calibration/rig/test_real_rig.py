@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.real_data import RealFiles
+from support.verdicts import verdict_on
 
 from neurocal_cli import Correspondences, Rig, calibrate_rig, evaluate_rig
 
@@ -58,8 +59,7 @@ def test_the_cameras_are_where_single_frames_put_them(rig: Rig) -> None:
     assert rig.converged
     assert near_the_distances(rig)
     # A rig of webcams that are not triggered together is no good one, and no camera of it has moved.
-    assert rig.verdict is not None
-    assert not any("moved" in reason for reason in rig.verdict.reasons)
+    assert not any("moved" in reason for reason in verdict_on(rig).reasons)
 
 
 def test_two_cameras_predict_what_a_third_sees_in_other_frames(rig: Rig, real_files: RealFiles) -> None:
@@ -67,8 +67,7 @@ def test_two_cameras_predict_what_a_third_sees_in_other_frames(rig: Rig, real_fi
     found = evaluate_rig(rig, others)
     assert sum(count for count, _ in found.predicted.values()) > 500
     assert np.median([error for _, error in found.predicted.values()]) < 4
-    assert found.verdict is not None
-    assert not any("since the calibration" in reason for reason in found.verdict.reasons)
+    assert not any("since the calibration" in reason for reason in verdict_on(found).reasons)
 
 
 def test_a_camera_one_frame_late_is_found(real_files: RealFiles) -> None:

@@ -15,6 +15,7 @@ from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.rigs import random_rig, sides
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 
 from neurocal_cli import calibrate, calibrate_stereo, fit_stereo, read_points, triangulate
@@ -52,14 +53,13 @@ def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_verdict_is_in_the_file_and_is_reached_again_from_it(bumped: Path) -> None:
     rig = read_stereo_rig(bumped / "rig.yaml")
-    assert rig.verdict is not None
-    assert rig.verdict.word == "poor"
+    assert verdict_on(rig).word == "poor"
     again = assess_rig(rig)
     assert again is not None
     assert (again.word, again.reasons, again.advice) == (
-        rig.verdict.word,
-        rig.verdict.reasons,
-        rig.verdict.advice,
+        verdict_on(rig).word,
+        verdict_on(rig).reasons,
+        verdict_on(rig).advice,
     )
     assert evaluate_stereo_rig(rig).verdict == again
 
@@ -90,8 +90,7 @@ def test_two_calibrations_without_one_rig_are_poor() -> None:
     left, right = (calibrate(side, distortion="none", skew=False) for side in seen(scene()))
     pixels = right.points.pixels.reshape(12, -1, 2)[np.random.default_rng(2).permutation(12)]
     shuffled = calibrate(replace(right.points, pixels=pixels.reshape(-1, 2)), distortion="none", skew=False)
-    verdict = evaluate_stereo(left, shuffled).verdict
-    assert verdict is not None
+    verdict = verdict_on(evaluate_stereo(left, shuffled))
     assert verdict.word == "poor"
     assert "contradict" in verdict.reasons[0]
 
@@ -103,8 +102,7 @@ def test_the_depth_is_as_uncertain_as_it_is_wrong() -> None:
     for seed in range(8):
         rig = judged(seen(some, 0.3, seed)).rig
         assert rig is not None
-        assert rig.verdict is not None
-        told.append(rig.verdict.measures["depth_share"])
+        told.append(verdict_on(rig).measures["depth_share"])
         true = some.poses["03"].R @ some.world[20] + some.poses["03"].t
         pixels = some.see(0, true[None]), some.see(1, (some.rig.R @ true + some.rig.t)[None])
         errors.append(triangulate(rig.left, rig.right, rig.pose, *pixels).points[0, 2] / true[2] - 1)
@@ -127,9 +125,8 @@ def test_what_is_wrong_with_a_rig_is_named_and_its_baseline_is_right(
     real_files: RealFiles, name: str, words: str
 ) -> None:
     rig = shared(real_files, name)
-    assert rig.verdict is not None
-    assert rig.verdict.word == "poor"
-    assert words in rig.verdict.reasons[0]
+    assert verdict_on(rig).word == "poor"
+    assert words in verdict_on(rig).reasons[0]
     assert abs(rig.baseline - 120.35) < 3 * rig.std["baseline"]
     if name == "sync2mm":  # both cameras are as they were
         assert abs(rig.left.intrinsics.alpha_u - 1000) < 4 * rig.left.std["alpha_u"]
@@ -138,9 +135,8 @@ def test_what_is_wrong_with_a_rig_is_named_and_its_baseline_is_right(
 @pytest.mark.parametrize("name", slow_but(("bump01",), ["bump01", "bump05"]))
 def test_a_bump_half_way_is_named_and_nothing_else_suffers(real_files: RealFiles, name: str) -> None:
     rig = shared(real_files, name)
-    assert rig.verdict is not None
-    assert rig.verdict.word == "poor"
-    assert "moved between left06/right06 and left07/right07" in rig.verdict.reasons[0]
+    assert verdict_on(rig).word == "poor"
+    assert "moved between left06/right06 and left07/right07" in verdict_on(rig).reasons[0]
     assert len(rig.pairs) == 7
     assert abs(rig.baseline - 120.35) < 0.2 + (name == "bump05")  # which moved the camera by 1 mm
     for camera, alpha in ((rig.left, 1000), (rig.right, 1010)):
@@ -149,9 +145,8 @@ def test_a_bump_half_way_is_named_and_nothing_else_suffers(real_files: RealFiles
 
 def test_the_sample_rig_is_good() -> None:
     rig = calibrate_stereo(*(read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right")))
-    assert rig.verdict is not None
-    assert (rig.verdict.word, rig.verdict.reasons) == ("good", ())
-    assert pickle.loads(pickle.dumps(rig)).verdict == rig.verdict
+    assert (verdict_on(rig).word, verdict_on(rig).reasons) == ("good", ())
+    assert pickle.loads(pickle.dumps(rig)).verdict == verdict_on(rig)
 
 
 @pytest.mark.slow  # detection; tests/commands/test_cli_stereo.py has a quick one
@@ -163,13 +158,12 @@ def test_a_real_rig_is_not_blamed(real_files: RealFiles, tmp_path: Path, layout:
         words = ["--cols", "9", "--rows", "6", "--square", "25", "--points", layout]
         assert run("detect", *images, *words, "-o", tmp_path / f"{side}.csv").exit_code == 0
     rig = calibrate_stereo(*(read_points(tmp_path / f"{side}.csv") for side in ("left", "right")))
-    assert rig.verdict is not None
-    assert rig.verdict.word in ("good", "usable")
+    assert verdict_on(rig).word in ("good", "usable")
     assert all(
         reason.startswith(("left camera:", "right camera:", "both cameras:"))
-        for reason in rig.verdict.reasons
+        for reason in verdict_on(rig).reasons
     )
-    assert 1.0 < rig.verdict.measures["scatter"] < 6.0
+    assert 1.0 < verdict_on(rig).measures["scatter"] < 6.0
     assert len(rig.pairs) == 13
 
 
@@ -212,8 +206,7 @@ def test_given_cameras_that_are_exchanged_are_named_before_what_follows_from_it(
     exchanged = [
         calibrate(side, type=3, intrinsics=one) for side, one in zip(points[1], own[::-1], strict=True)
     ]
-    verdict = fit_stereo(*exchanged).verdict
-    assert verdict is not None
+    verdict = verdict_on(fit_stereo(*exchanged))
     assert verdict.word != "good"
     assert "left camera: alpha_u" in verdict.reasons[0]
     assert verdict.measures["scatter"] > 4

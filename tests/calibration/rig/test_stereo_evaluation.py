@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
+from support.verdicts import verdict_on
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_stereo, fit_stereo
@@ -173,9 +174,7 @@ def test_new_images_with_old_names_get_poses_of_their_own() -> None:
     assert inside.rig is not None
     assert found.rig is not None
     assert found.rig.rmse < 2 * inside.rig.rmse
-    assert found.verdict is not None
-    assert inside.verdict is not None
-    assert found.verdict.word == inside.verdict.word
+    assert verdict_on(found).word == verdict_on(inside).word
 
 
 @pytest.mark.parametrize(
@@ -196,8 +195,7 @@ def test_given_points_of_another_rig_are_not_good(what: str) -> None:
     if what == "the same camera twice":
         views = [name.replace("left", "right") for name in points[0].view_names]
         points = points[0], replace(points[0], view=[views[k] for k in points[0].view_index])
-    verdict = evaluate_stereo(left, right, points).verdict
-    assert verdict is not None
+    verdict = verdict_on(evaluate_stereo(left, right, points))
     assert verdict.word == "poor"
     assert any("on the given points" in reason for reason in verdict.reasons)
 

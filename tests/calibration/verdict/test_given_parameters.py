@@ -14,6 +14,7 @@ from support.distorted import through
 from support.scenes import random_flat_set
 from support.slow_cases import slow_but
 from support.targets import photographed
+from support.verdicts import verdict_on
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, calibrate
@@ -37,10 +38,9 @@ def four_views() -> Correspondences:
 )
 def test_a_given_centre_that_is_off_is_named(u0: float, word: str) -> None:
     """15 px of 600 raise the error by a fifth only, as the poses give way."""
-    verdict = calibrate(
-        four_views(), type=3, intrinsics=Intrinsics(600.0, 600.0, u0, 243.0, np.pi / 2)
-    ).verdict
-    assert verdict is not None
+    verdict = verdict_on(
+        calibrate(four_views(), type=3, intrinsics=Intrinsics(600.0, 600.0, u0, 243.0, np.pi / 2))
+    )
     assert verdict.word == word
     named = [reason for reason in verdict.reasons if f"u0 = {u0:g} is given, but the points give" in reason]
     assert len(named) == (word != "good")
@@ -48,8 +48,7 @@ def test_a_given_centre_that_is_off_is_named(u0: float, word: str) -> None:
 
 def test_a_given_focal_length_that_is_off_is_named() -> None:
     camera = Intrinsics(640.0, 640.0, 318.0, 243.0, np.pi / 2)
-    verdict = calibrate(four_views(), type=3, intrinsics=camera).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(four_views(), type=3, intrinsics=camera))
     assert "alpha_u = 640 is given, but the points give 60" in verdict.reasons[0]
 
 
@@ -63,8 +62,7 @@ def test_focal_lengths_that_are_wrong_by_one_factor_are_told_from_five_views(tri
     for factor, named in ((1.005, True), (1.0, False)):
         of_both = true.intrinsics.alpha_u * factor, true.intrinsics.alpha_v * factor
         wrong = replace(true.intrinsics, alpha_u=of_both[0], alpha_v=of_both[1])
-        verdict = calibrate(points, type=3, intrinsics=replace(true, intrinsics=wrong)).verdict
-        assert verdict is not None
+        verdict = verdict_on(calibrate(points, type=3, intrinsics=replace(true, intrinsics=wrong)))
         assert any("is given, but the points give" in reason for reason in verdict.reasons) == named
 
 
@@ -84,9 +82,8 @@ def test_a_given_centre_or_lens_that_is_hardly_wrong_is_not_good(what: str, tria
     lens = Camera(true, Distortion("k1", np.array([0.02])))
     found = calibrate(points, type=3, intrinsics=centre if what == "centre" else lens)
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
-    assert any("given" in reason for reason in found.verdict.reasons)
+    assert verdict_on(found).word != "good"
+    assert any("given" in reason for reason in verdict_on(found).reasons)
 
 
 @pytest.mark.parametrize("trials", [10, pytest.param(200, marks=pytest.mark.slow)])
@@ -138,8 +135,7 @@ def test_a_bent_board_does_not_make_a_true_centre_wrong(seeds: int) -> None:
         points, truth = photographed("parabola", seed, 12, 0.5)
         found = calibrate(points, type=2, image_center=(truth.K[0, 2], truth.K[1, 2]), distortion="k1k2")
         assert found.target is not None
-        assert found.verdict is not None
-        assert not any("is given, but" in reason for reason in found.verdict.reasons)
+        assert not any("is given, but" in reason for reason in verdict_on(found).reasons)
 
 
 @pytest.mark.parametrize(
@@ -159,9 +155,8 @@ def test_a_wrong_centre_and_a_board_off_its_file_are_told_together(
     turn = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     wrong = centre + off * np.array([np.cos(turn), np.sin(turn)])
     found = calibrate(points, type=2, image_center=(float(wrong[0]), float(wrong[1])))
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
-    (given,) = [reason for reason in found.verdict.reasons if "is given, but the points give" in reason]
+    assert verdict_on(found).word != "good"
+    (given,) = [reason for reason in verdict_on(found).reasons if "is given, but the points give" in reason]
     assert "standard deviations from the reported ones" in given
     told = dict(re.findall(r"(.0) = [0-9.]+ is given, but the points give ([0-9.]+)", given))
     assert np.abs([float(told["u0"]) - centre[0], float(told["v0"]) - centre[1]]).max() < 3.0
@@ -171,8 +166,7 @@ def test_the_middle_of_the_image_is_not_taken_for_the_centre() -> None:
     points = flat()
     assert points.image_size is not None
     width, height = points.image_size
-    verdict = calibrate(points, type=2, image_center=((width - 1) / 2, (height - 1) / 2)).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(points, type=2, image_center=((width - 1) / 2, (height - 1) / 2)))
     assert verdict.word != "good"
     assert any("middle of the image" in reason for reason in verdict.reasons)
 
@@ -180,14 +174,12 @@ def test_the_middle_of_the_image_is_not_taken_for_the_centre() -> None:
 def test_one_flat_view_does_not_tell_what_it_would_ask_for() -> None:
     points = flat().select(np.arange(3 * 93, 4 * 93))
     found = calibrate(points, type=2, skew=False, image_center=(318.0, 243.0))
-    assert found.verdict is not None
-    assert not any("is given, but" in reason for reason in found.verdict.reasons)
+    assert not any("is given, but" in reason for reason in verdict_on(found).reasons)
 
 
 def test_a_camera_that_is_given_without_its_distortion_is_named() -> None:
     points, truth = photographed("flat", 1, 6, 0.0)
-    verdict = calibrate(points, type=3, intrinsics=truth.K).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(points, type=3, intrinsics=truth.K))
     assert verdict.word == "poor"
     assert "the camera is given without distortion, but the points show one" in verdict.reasons[0]
 
@@ -198,9 +190,8 @@ def test_a_given_distortion_that_is_off_is_named_instead_of_a_bent_board() -> No
     camera = Camera(Intrinsics.from_matrix(truth.K), Distortion("k1k2", [truth.k[0] * 0.95, truth.k[1]]))
     found = calibrate(points, type=3, intrinsics=camera)
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
-    assert "the given distortion does not fit these points" in found.verdict.reasons[0]
+    assert verdict_on(found).word != "good"
+    assert "the given distortion does not fit these points" in verdict_on(found).reasons[0]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.04])
@@ -209,8 +200,7 @@ def test_one_flat_view_contradicts_a_wrong_focal_length(share: float) -> None:
     points = flat()
     one = points.select(points.view_index == 3)
     f = 600.0 * (1 + share)
-    verdict = calibrate(one, type=3, intrinsics=Intrinsics(f, f, 318.0, 243.0, np.pi / 2)).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(one, type=3, intrinsics=Intrinsics(f, f, 318.0, 243.0, np.pi / 2)))
     assert (verdict.word == "good") == (share == 0.0)
     if share:
         assert "the given camera does not fit these points" in verdict.reasons[0]
@@ -222,8 +212,7 @@ def test_a_small_error_of_a_given_centre_counts_as_it_moves_the_poses(share: flo
     points, truth = photographed("flat", 3, 15, 0.0)
     camera = Intrinsics.from_matrix(truth.K + share * truth.K[0, 0] * np.outer([1, 0, 0], [0, 0, 1]))
     lens = Distortion("k1k2", truth.k)
-    verdict = calibrate(points, type=3, intrinsics=Camera(camera, lens)).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(points, type=3, intrinsics=Camera(camera, lens)))
     assert (verdict.word == "good") == (share == 0.0)
     if share:
         assert "standard deviations from the reported ones" in verdict.reasons[0]
@@ -269,9 +258,8 @@ def test_given_poses_that_are_all_wrong_are_the_cause_not_lens_or_target() -> No
     rng = np.random.default_rng(0)
     found = with_given_poses(lambda k, R, t: (turned(rng, 0.1) @ R, t + 0.5 * rng.normal(size=3)))
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word == "poor"
-    assert "the given poses are wrong, each in its own way, by 0." in found.verdict.reasons[0]
+    assert verdict_on(found).word == "poor"
+    assert "the given poses are wrong, each in its own way, by 0." in verdict_on(found).reasons[0]
 
 
 @pytest.mark.parametrize(("side", "words"), [("camera", "hand-eye"), ("target", "elsewhere")])
@@ -284,10 +272,9 @@ def test_one_motion_of_all_given_poses_is_told(side: str, words: str) -> None:
 
     found = with_given_poses(moved)
     assert found.target is None
-    assert found.verdict is not None
-    assert found.verdict.word == "poor"
-    assert f"by one motion of the {side}" in found.verdict.reasons[0]
-    assert words in found.verdict.reasons[0]
+    assert verdict_on(found).word == "poor"
+    assert f"by one motion of the {side}" in verdict_on(found).reasons[0]
+    assert words in verdict_on(found).reasons[0]
 
 
 @pytest.mark.parametrize("outliers", ["reject", "keep"])
@@ -299,15 +286,13 @@ def test_one_given_pose_that_is_wrong_is_named(outliers: Literal["reject", "keep
         assert found.rejected.views == {"v04": "its given pose is wrong: its points fit another one"}
         assert found.rmse_px < 0.15
     else:
-        assert found.verdict is not None
-        assert found.verdict.word == "poor"
-        assert "v04: the given pose is wrong, by 5 mm" in found.verdict.reasons[0]
+        assert verdict_on(found).word == "poor"
+        assert "v04: the given pose is wrong, by 5 mm" in verdict_on(found).reasons[0]
 
 
 def test_right_given_poses_are_not_accused() -> None:
     found = with_given_poses(lambda k, R, t: (R, t))
-    assert found.verdict is not None
-    assert found.verdict.word == "good"
+    assert verdict_on(found).word == "good"
     assert not found.rejected.views
 
 
@@ -316,8 +301,7 @@ def test_given_poses_that_are_off_are_not_excused_by_a_board_that_bends() -> Non
     points, truth = photographed("flat", 5, 8, 0.0)
     places = truth.t + np.array([0.0, 0.0, 2.0])
     poses = {name: Pose(R, t) for name, R, t in zip(points.view_names, truth.R, places, strict=True)}
-    verdict = calibrate(points, type=4, extrinsics=poses, distortion="k1k2").verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(points, type=4, extrinsics=poses, distortion="k1k2"))
     assert verdict.word != "good"
 
 
@@ -358,5 +342,4 @@ def test_a_wrong_distortion_is_named_once_and_leaves_the_target_alone() -> None:
     given = Intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.pi / 2)
     found = calibrate(points, type=3, intrinsics=Camera(given, Distortion("k1k2", np.array([-0.18, 0.08]))))
     assert found.target is None
-    assert found.verdict is not None
-    assert sum("distortion" in reason for reason in found.verdict.reasons) == 1
+    assert sum("distortion" in reason for reason in verdict_on(found).reasons) == 1

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.verdicts import verdict_on
 from support.wrong_inputs import flat, moved, scaled
 from support.wrong_rigs import scene, seen
 
@@ -79,8 +80,7 @@ def test_undistorted_points_may_lie_outside_the_image() -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 def test_an_axis_that_points_the_other_way_is_named(axis: int) -> None:
     pixels = POINTS.pixels * [-1 if k == axis else 1 for k in range(2)]
-    verdict = calibrate(replace(POINTS, pixels=pixels, image_size=None)).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(replace(POINTS, pixels=pixels, image_size=None)))
     assert verdict.word == "usable"
     assert verdict.reasons[0].startswith(f"{'uv'[axis]} of all points is negative")
     middle = replace(POINTS, pixels=POINTS.pixels - [320, 240], image_size=None)
@@ -117,8 +117,7 @@ def test_two_images_under_one_name_are_named_in_any_unit(unit: float) -> None:
 def test_outliers_are_named_by_what_they_have_in_common() -> None:
     world = POINTS.world.copy()
     world[np.arange(len(world)) % 93 == 40, 0] += 6
-    verdict = calibrate(moved(POINTS, world)).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(moved(POINTS, world)))
     assert verdict.word == "usable"
     (reason,) = verdict.reasons
     told = (
@@ -133,8 +132,7 @@ def test_outliers_are_named_by_what_they_have_in_common() -> None:
 def test_a_view_that_is_left_out_with_its_cause_lies_outside_nothing() -> None:
     points = seen(scene())[1]
     swapped = np.where((points.view_index == 3)[:, None], points.pixels[:, ::-1], points.pixels)
-    verdict = calibrate(replace(points, pixels=swapped), distortion="none", skew=False).verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(replace(points, pixels=swapped), distortion="none", skew=False))
     assert verdict.word == "usable"
     assert len(verdict.reasons) == 1
     assert "right04 (its u and v are exchanged)" in verdict.reasons[0]

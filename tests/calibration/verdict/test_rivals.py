@@ -15,6 +15,7 @@ from support.scenes import table_1
 from support.slow_cases import slow_but
 from support.targets import photographed as target_photographed
 from support.targets import stabilised
+from support.verdicts import verdict_on
 from support.wide_scenes import wide_set
 from support.wrong_inputs import by_rolling_shutter, of_cameras
 
@@ -30,8 +31,7 @@ OFF = np.array([45.0, -45.0])  # px; of the image centre from where the simulate
 
 
 def reasons(calibration: Calibration) -> str:
-    assert calibration.verdict is not None
-    return " | ".join(calibration.verdict.reasons)
+    return " | ".join(verdict_on(calibration).reasons)
 
 
 def held(calibration: Calibration) -> Contest:
@@ -90,10 +90,9 @@ CHANGES = {
 
 def silently_wrong(cal: Calibration, share: float) -> bool:
     """Good, with a focal length that none of the views had, by 3 of its deviations or by 1 %."""
-    assert cal.verdict is not None
     alpha = cal.intrinsics.alpha_u
     off = max(ALPHA - alpha, alpha - ALPHA * (1 + share), 0.0)
-    return cal.verdict.word == "good" and (off > 3 * cal.std["alpha_u"] or off > 0.01 * ALPHA)
+    return verdict_on(cal).word == "good" and (off > 3 * cal.std["alpha_u"] or off > 0.01 * ALPHA)
 
 
 def told(change: str, share: float, seeds: Iterable[int]) -> int:
@@ -155,8 +154,7 @@ def test_a_crop_is_told() -> None:
 def test_images_of_another_width_are_told_beside_a_bend() -> None:
     points, _ = target_photographed("parabola", 801, 14, 0.6, sigma=0.15)
     wider = np.where(np.isin(points.view_index, [0, 3, 4, 9])[:, None], points.pixels * [0.01, 0.0], 0.0)
-    verdict = calibrate(displaced(points, wider), target="given", outliers="keep").verdict
-    assert verdict is not None
+    verdict = verdict_on(calibrate(displaced(points, wider), target="given", outliers="keep"))
     assert any("two cameras" in why and "v00, v03, v04 and 1 more fit" in why for why in verdict.reasons)
 
 
@@ -248,8 +246,7 @@ def test_a_cut_of_a_fraction_of_a_pixel_is_told_where_the_noise_is_far_smaller(
     points, _ = target_photographed("flat", seed, 12, sigma=0.004)
     right = (points.pixels[:, 0] > 640)[:, None]
     found = calibrate(displaced(points, np.where(right, by, 0.0)))
-    assert found.verdict is not None
-    assert found.verdict.reasons[0].startswith("the right half of the images is displaced by (")
+    assert verdict_on(found).reasons[0].startswith("the right half of the images is displaced by (")
     assert bool(len(found.rejected)) == ("because of it" in reasons(found))
 
 
@@ -303,8 +300,7 @@ def test_rays_that_do_not_meet_in_one_point_are_told(seed: int, shift: float) ->
     moved = scene.camera.project(seen)[0] - scene.camera.project(X)[0]
     central, found = calibrate(scene.points), calibrate(displaced(scene.points, moved))
     assert not reasons(central)
-    assert found.verdict is not None
-    assert found.verdict.word == "usable"
+    assert verdict_on(found).word == "usable"
     assert reasons(found).startswith("near and far targets do not fit one camera")
     assert "which makes the focal length" in reasons(found)
 
@@ -360,8 +356,7 @@ def test_boards_far_from_their_description_give_the_true_camera() -> None:
         found = calibrate(points)
         assert abs(found.intrinsics.alpha_u - CAMERA.intrinsics.alpha_u) < 4 * found.std["alpha_u"] < 3
         assert told in reasons(found)
-        assert found.verdict is not None
-        assert found.verdict.word == word
+        assert verdict_on(found).word == word
 
 
 @pytest.mark.parametrize("by", [0.3, 0.6])
@@ -382,10 +377,9 @@ def test_curls_of_all_sizes(by: float) -> None:
     named = 0
     for seed in range(30):
         cal = curled(by, seed, 9 + seed % 10)
-        assert cal.verdict is not None
         off = abs(cal.intrinsics.alpha_u - ALPHA)
         wrong = off > 3 * cal.std["alpha_u"] or off > 0.01 * ALPHA
-        assert not (wrong and cal.verdict.word == "good")
+        assert not (wrong and verdict_on(cal).word == "good")
         named += "it seems bent by" in reasons(cal)
     assert named >= (21 if by < 0.4 else 27)
 
@@ -396,9 +390,8 @@ def test_curls_of_all_sizes(by: float) -> None:
 )
 def test_a_stretch_that_makes_the_focal_length_wrong_is_the_reason(seed: int, says: str) -> None:
     found = calibrate(scene(seed)[0], target="given")
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
-    assert says in found.verdict.reasons[0]
+    assert verdict_on(found).word != "good"
+    assert says in verdict_on(found).reasons[0]
 
 
 def test_a_lens_that_is_too_simple_is_told() -> None:
@@ -469,8 +462,7 @@ def test_boards_of_another_shape_are_no_other_cause(shape: str) -> None:
         points, _ = target_photographed(shape, seed + 10, 6 + seed % 15, 0.3, sigma=0.12)
         for target in ("auto", "given"):
             found = calibrate(points, distortion="k1k2", target=target)
-            assert found.verdict is not None
-            said = [reason for reason in found.verdict.reasons if "outliers" not in reason]
+            said = [reason for reason in verdict_on(found).reasons if "outliers" not in reason]
             for some in ("stabilisation", "turned by", "zoom", "two cameras"):
                 assert not any(some in reason for reason in said), said
 
@@ -491,8 +483,7 @@ def with_noise_that_neighbours_share(
 def test_noise_that_neighbours_share_is_no_cause() -> None:
     points, _ = target_photographed("flat", 618, 15, 0.0, sigma=0.05)
     found = calibrate(with_noise_that_neighbours_share(points, 0.1, np.random.default_rng(18)))
-    assert found.verdict is not None
-    assert found.verdict.word == "good", found.verdict.reasons
+    assert verdict_on(found).word == "good", verdict_on(found).reasons
 
 
 @pytest.mark.parametrize(
@@ -546,8 +537,7 @@ def test_photographs_are_not_accused(real_files: RealFiles, name: str) -> None:
     found = calibrate(read_points(real_files(f"photographs/points_{name}.csv")[0]))
     said = reasons(found)
     assert not any(some in said for some in ("turned by", "zoom", "two sizes", "centre moves", "no single"))
-    assert found.verdict is not None
-    assert (found.verdict.word == "good") == (name == "fisheye_easel")
+    assert (verdict_on(found).word == "good") == (name == "fisheye_easel")
 
 
 @pytest.mark.parametrize(
@@ -566,8 +556,7 @@ def test_photographs_are_not_accused(real_files: RealFiles, name: str) -> None:
 def test_field_reports(real_files: RealFiles, name: str, words: str) -> None:
     found = calibrate(read_points(real_files(f"{name}.csv")[0]))
     assert words in reasons(found)
-    assert found.verdict is not None
-    assert found.verdict.word != "good"
+    assert verdict_on(found).word != "good"
 
 
 @pytest.mark.parametrize("name", ["print1030_20_0", "print1030_35_1"])
@@ -597,5 +586,4 @@ def test_what_an_estimated_shape_has_taken_in_does_not_hide_another_cause() -> N
     bent, _ = target_photographed("parabola", 800, 14, 0.6, sigma=0.15)
     camera = calibrate(rescaled(bent, np.arange(14) % 2 == 1, 1.01))
     assert camera.target is not None
-    assert camera.verdict is not None
-    assert "scaled by 1.0" in camera.verdict.reasons[0]
+    assert "scaled by 1.0" in verdict_on(camera).reasons[0]
