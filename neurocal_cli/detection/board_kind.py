@@ -203,7 +203,9 @@ class _Seen:
             return True
         board = seen_board(image)
         others = all_kinds and not self.squares
-        if others and (board is None or not board.plain) and not self.marked and self._add_marked(image):
+        # A floor may be a chessboard, too, that the image cuts off.
+        unsure = board is None or not board.plain or board.vote is Vote.NONE
+        if others and unsure and not self.marked and self._add_marked(image):
             return True
         if board is not None:
             (self.squares if board.plain else self.patterned).append(board)
@@ -245,9 +247,9 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
             break
     if not seen.kind and seen.patterned:
         raise NoBoardError(
-            "the squares of the board are blurred or have patterns in them, and no markers can be read; take "
-            "sharper images, or describe the board by --board, for example chessboard:9x6:25 or "
-            "charuco:8x6:28:21"
+            "the squares of the board are blurred, unevenly lit or have patterns in them, and no markers can "
+            "be read; take sharper images without reflections, or describe the board by --board, for example "
+            "chessboard:9x6:25 or charuco:8x6:28:21"
         )
     if not seen.kind:
         raise NoBoardError(

@@ -29,6 +29,7 @@ from neurocal_cli.detection.circles.lattice import PlacedCircles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.placement import (
+    NEARER,
     SYMMETRIC_BOARD,
     End,
     NoBoardError,
@@ -50,7 +51,6 @@ _CLEARLY = 3.0  # ratio to the best rms error above which an arrangement is excl
 _NOISE = 0.05  # px; least rms error in this ratio
 _MISFIT = 0.25  # squares; greatest rms error of the best arrangement, for distortion and uneven boards
 _SAMPLES = 25  # vertices of a grid used in these tests
-_NEARER = 1.5  # ratio of the squares' sizes above which the larger of two boards is preferred
 _MOST_TRIED = 5000  # limits the time; small pieces of large planes have more arrangements
 _KEPT = 200  # best arrangements that are extended by a further grid; limits the time
 
@@ -154,7 +154,7 @@ def _may_be_a_piece(candidate: _Candidate, other: _Candidate) -> bool:
     """Whether a grid may be a piece of a larger grid's board, which has another size."""
     ends_seen = candidate.whole and set(candidate.ends.values()) == {End.BOARD}
     smaller = candidate.grid.seen.sum() < other.grid.seen.sum()
-    behind = candidate.grid.square >= _NEARER * other.grid.square
+    behind = candidate.grid.square >= NEARER * other.grid.square
     return bool(smaller and not ends_seen and not behind)
 
 
@@ -170,7 +170,7 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
         room = sizes.count(size)
         alike = [c for c in candidates if c.whole and tuple(sorted(c.grid.shape)) == size]
         alike.sort(key=lambda c: -c.grid.square)
-        if len(alike) > room and alike[room - 1].grid.square < _NEARER * alike[room].grid.square:
+        if len(alike) > room and alike[room - 1].grid.square < NEARER * alike[room].grid.square:
             raise NoBoardError(
                 f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; show only one of "
                 "them"

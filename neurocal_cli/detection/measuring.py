@@ -103,7 +103,9 @@ def measure(
         return _vertices(grid_image, fitted, vertices)
     uneven = fitted.map.excess > _AGREES
     if grid.paired:  # there is nothing along the edges, and no rim
-        return _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices).only(fitted.good)
+        # Fewer edges than the map has unknowns rest on the corners, of which one may be read wrongly.
+        good = fitted.good & (fitted.good.sum() >= len(fitted.map.map.free))
+        return _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices).only(good)
     inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices, uneven)
     if points == "midpoints":
         along = positions_along_edges(grid_image, fitted)

@@ -252,6 +252,8 @@ _FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a c
 # for boards, and at most 0.77 for blinds, tiled floors and textures. It changes only a message.
 _WHOLE = 0.8
 
+NEARER = 1.5  # ratio of the sizes above which the larger of two equal boards is preferred
+
 SYMMETRIC_BOARD = (
     "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
     "get the same point ids in all images, use a board with an even number of inner vertices on one side and "

@@ -24,7 +24,7 @@ from neurocal_cli.detection.placement import NoBoardError
 from neurocal_cli.files.board_kinds import kind_of
 from neurocal_cli.files.images import read_image
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.observations.board_kinds import TagPlane
+from neurocal_cli.observations.board_kinds import TagPlane, found_words
 from neurocal_cli.observations.marked_cells import Print, marked_cells
 
 
@@ -83,6 +83,20 @@ def test_the_side_of_the_markers_is_told_by_one_between_four_vertices() -> None:
     found = board_in("charuco:3x5:30:22:DICT_6X6_250", square=40.0)
     assert found.plane.markers is not None
     assert found.plane.markers.side == pytest.approx(22 / 30, abs=0.004)  # 0.7
+
+
+def test_a_floor_of_squares_does_not_hide_a_board_with_markers() -> None:
+    picture = taken(marked_scene(plane_of("charuco:6x5:40:28:DICT_5X5_50"), 3, square=36.0), 3, 2)
+    vertices = picture.truth.planes[0].vertices.reshape(-1, 2)
+    outline = cv2.convexHull(vertices.astype(np.float32)).reshape(-1, 2)
+    paper = np.zeros(picture.image.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(
+        paper, np.rint(outline.mean(axis=0) + 1.7 * (outline - outline.mean(axis=0))).astype(int), 1
+    )
+    v, u = np.indices(paper.shape)
+    floor = np.where((u // 18 + v // 18) % 2 == 0, 50.0, 190.0)
+    image = np.where(paper > 0, picture.image, cv2.GaussianBlur(floor, (0, 0), 0.8)).round().astype(np.uint8)
+    assert found_words(found_board([image]).plane) == found_words(plane_of("charuco:6x5:1:0.7:DICT_5X5_50"))
 
 
 @pytest.mark.parametrize("gamma", [0.6, 2.2])
@@ -447,5 +461,7 @@ def test_tags_without_squares_at_their_corners_are_named() -> None:
 
 def test_a_blurred_chessboard_is_not_told_to_have_markers() -> None:
     image = np.array(read_image(SAMPLES / "board02.png").grey)
-    with pytest.raises(NoBoardError, match=r"are blurred or have patterns in them.*sharper images"):
+    with pytest.raises(
+        NoBoardError, match=r"are blurred, unevenly lit or have patterns in them.*sharper images"
+    ):
         found_board([cv2.GaussianBlur(image, (0, 0), 7.0)])

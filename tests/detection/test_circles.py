@@ -206,6 +206,19 @@ def test_rings_are_found_by_their_outer_edges(radius: int, width: int, blur: flo
     assert (str(found), found.full) == ("7 x 6 circles", True)
 
 
+def test_two_equal_grids_are_refused_unless_one_is_clearly_nearer() -> None:
+    plane = plane_of(SYMMETRIC)
+    near, other, far = (
+        taken(marked_scene(plane, seed, square=square), seed, 2).image
+        for seed, square in ((1, 40.0), (2, 40.0), (2, 22.0))
+    )
+    with pytest.raises(NoBoardError, match="two grids of 5 x 4 circles"):
+        detect_points(np.concatenate([near, other], axis=1), Board((plane,)))
+    assert (
+        detect_points(np.concatenate([far, near], axis=1), Board((plane,))).pixels[:, 0].min() > far.shape[1]
+    )
+
+
 def test_another_number_of_circles_is_no_board() -> None:
     scene = marked_scene(plane_of(ASYMMETRIC), 2, square=22.0)
     image = taken(scene, 2).image

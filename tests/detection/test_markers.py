@@ -676,6 +676,40 @@ def test_tags_that_are_not_read_before_a_fisheye_are_found_from_the_others(seed:
     assert np.abs(error).max() < 0.05
 
 
+def test_six_edges_of_two_tags_do_not_determine_a_map() -> None:
+    """A corner of one is read 13 px off, which displaced its mid-points by up to 6 px."""
+    light = Illumination(0.580638882712979, (-0.6818860952195618, 0.44167237990467145))
+    flat = marked_scene(
+        plane_of("aprilgrid:5x3:40:0.4:tag16h5"),
+        20503,
+        45.97157762929719,
+        tilt=37.60850281647947,
+        psf=1.0700773244878095,
+        noise=3.972972639907888,
+        shift=(5.695690030887974, -34.92137959242878),
+        illumination=light,
+    )
+    picture = taken(before_fisheye(flat, 0.7), 20503, 2)
+    pale = 128 + 0.6 * (picture.image - 128.0)
+    sharpened = np.clip(np.rint(pale + 2 * (pale - gaussian_filter(pale, 1.0))), 0, 255).astype(np.uint8)
+    with pytest.raises(NoBoardError, match="only 0 of 8 points"):
+        detect_points(sharpened, Board((flat.targets[0].plane,)))
+
+
+@pytest.mark.parametrize("form", ["charuco:5x4:40:30:DICT_4X4_50", "aprilgrid:3x2:40:0.3"])
+def test_two_equal_boards_are_refused_unless_one_is_clearly_nearer(form: str) -> None:
+    near, other, far = (
+        taken(marked_scene(plane_of(form), seed, square=square), seed, 2).image
+        for seed, square in ((1, 48.0), (2, 48.0), (2, 24.0))
+    )
+    board = short_board(form)
+    assert board is not None
+    with pytest.raises(NoBoardError, match="two boards with the same markers"):
+        detect_points(np.concatenate([near, other], axis=1), board)
+    found = detect_points(np.concatenate([far, near], axis=1), board)
+    assert found.pixels[:, 0].min() > far.shape[1]
+
+
 def test_mid_points_before_a_fisheye_with_few_parameters_are_measured() -> None:
     """The edges to the rim are compared with the lens that was found, which is none of the richer ones."""
     flat = marked_scene(plane_of("charuco:5x8:40:30:DICT_4X4_250"), 11, 22.0, psf=1.2)

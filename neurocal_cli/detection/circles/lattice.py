@@ -29,7 +29,7 @@ from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import predict_vertices
 from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
-from neurocal_cli.detection.placement import NoBoardError
+from neurocal_cli.detection.placement import NEARER, NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 _WINDOWS = (0.02, 0.06, 0.18)  # of the threshold, over the image's longer side
@@ -237,13 +237,19 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     Raises NoBoardError if a part of the board is seen that may be several parts, or marks that are not round.
     """
     count = plane.cols * plane.rows
-    best, *_ = lattices(blobs, count)
+    best, *others = lattices(blobs, count)
     least = max(min(_FEWEST, count), _LEAST_SHARE * count)
     if len(best) < least:
         return None
     at = np.array(list(best.values()), dtype=np.int64)
     index = np.array(list(best.keys()), dtype=np.int64)
     found, area = blobs.centre[at], blobs.area[at].astype(float)
+    alike = [list(one.values()) for one in others if len(one) == count]
+    if any(NEARER**2 * np.median(blobs.area[one]) > np.median(area) for one in alike):
+        raise NoBoardError(
+            f"two grids of {plane.cols} x {plane.rows} circles are detected; show only one of them, or cut "
+            "pictures that hold both images of a stereo camera apart"
+        )
     size = grey.shape[1], grey.shape[0]
     leave_out_strays(index.astype(float), found, area, flattening_of(index.astype(float), found, size))
     kept = np.isfinite(area)
@@ -261,9 +267,9 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
 
 
 def lattices(blobs: Blobs, enough: int) -> list[dict[tuple[int, int], int]]:
-    """The lattices that grow from starts, until one has `enough` places: the blob of each; the largest first.
+    """The lattices that grow from starts, until too few blobs are left for one of `enough` places.
 
-    No two have the same blobs, and there is at least one, which may be empty.
+    The blob of each place; the largest first. No two have the same blobs. There is one, which may be empty.
     """
     found: list[dict[tuple[int, int], int]] = []
     centre = blobs.centre
@@ -276,10 +282,11 @@ def lattices(blobs: Blobs, enough: int) -> list[dict[tuple[int, int], int]]:
             continue
         found.append(_grown(blobs, start))
         tried.update(found[-1].values())
-        if len(found[-1]) >= enough:
+        if len(found[-1]) >= enough and len(blobs) < len(tried) + enough:
             break
     kept: list[dict[tuple[int, int], int]] = []
-    for one in sorted(found, key=len, reverse=True):
+    # Of equal ones the nearest.
+    for one in sorted(found, key=lambda one: (len(one), blobs.area[[*one.values()]].sum()), reverse=True):
         if one and not any(set(one.values()) & set(other.values()) for other in kept):
             kept.append(one)
     return kept or [{}]

@@ -55,6 +55,7 @@ _SPACED = 0.9, 1.2
 # most 0.01 px in rendered views, and 0.2 to 0.4 px towards the dark with gamma 2.2 and a blur of 0.5 to 1.2
 # px; spacings of 0.2 and 0.25 differ by 0.02 sides.
 _DARKENED, _LIGHTENED, _PRINTED = 0.1, 0.8, 0.006
+_TWICE = 1.5  # places of a marker, on average
 _STRANGE = 8  # markers of another dictionary that are worth a word
 _MIRRORED = ((1, 0), (0, -1))
 
@@ -76,6 +77,12 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
             _check_border(plane, grey, quadrangles)
         if placed is None:
             continue
+        number, times = np.unique(placed.read.number, return_counts=True)
+        if times[np.isin(number, placed.marks.number)].mean() > _TWICE:
+            raise NoBoardError(
+                "two boards with the same markers are detected; show only one of them, or cut pictures that "
+                "hold both images of a stereo camera apart"
+            )
         if isinstance(plane, TagPlane) and plane.downwards:
             _check_spacing(plane, placed.marks)
         found, agree = _vertices(plane, placed, light), len(np.unique(placed.at))

@@ -20,6 +20,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.homographies import homographies, homography_at
 from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
+from neurocal_cli.detection.placement import NEARER
 from neurocal_cli.observations.markers import DICTIONARIES, code, code_count, correctable
 
 # Dictionaries that may be meant when none is named, those in use most first. The smaller ones of a size are
@@ -45,7 +46,7 @@ _APART = 0.02  # of its perimeter; of two nearer quadrangles, one is left out
 
 @frozen_dataclass(eq=False)
 class Marks:
-    """N markers read in an image."""
+    """N markers read in an image; two boards in it may have the same numbers."""
 
     number: NDArray[np.int64]  # (N,)
     corners: Array  # (N, 4, 2) [px] top left, top right, bottom right, bottom left of the upright marker
@@ -222,13 +223,18 @@ def markers_in(
     """The markers ``first`` to ``first + count - 1`` of a dictionary within quadrangles (N, 4, 2)."""
     H, corners = _framed(grey, corners)
     which, light = _cells(grey, H, DICTIONARIES[dictionary], border, wrong_border)
-    return _marks(corners[which], light, dictionary, first, count)
+    return _marks(corners[which], light, dictionary, first, count, boards=2)
 
 
 def _marks(
-    corners: Array, light: NDArray[np.bool_], dictionary: str, first: int = 0, count: int | None = None
+    corners: Array,
+    light: NDArray[np.bool_],
+    dictionary: str,
+    first: int = 0,
+    count: int | None = None,
+    boards: int = 1,
 ) -> Marks:
-    """The markers within quadrangles (N, 4, 2), by their light cells.
+    """The markers within quadrangles (N, 4, 2), by their light cells; of equal boards each number of each.
 
     Narrow windows of the threshold see a blurred border as a ring, which has an outline inside as well. So
     of several quadrangles of one number, the largest of those that fit it best is taken.
@@ -237,10 +243,18 @@ def _marks(
     around = np.hypot(*np.moveaxis(corners - np.roll(corners, 1, axis=1), 2, 0)).sum(axis=1)
     k = np.flatnonzero(number >= 0)
     k = k[np.lexsort((-around[k], -agreed[k]))]
-    number, one = np.unique(number[k], return_index=True)
+    middle, every = corners.mean(axis=1), k[:0]
+    for _ in range(boards):
+        names, one = np.unique(number[k], return_index=True)
+        best = k[one]
+        every = np.concatenate([every, best])
+        # In another place, read as well, and not clearly farther away.
+        best = best[np.searchsorted(names, number[k])]
+        away = np.hypot(*(middle[k] - middle[best]).T) > 0.25 * around[best]
+        k = k[away & (agreed[k] >= agreed[best]) & (NEARER * around[k] > around[best])]
     # The marker's first corner is that of the quadrangle to which the bits were turned.
-    order = (np.arange(4) + turn[k[one], None]) % 4
-    return Marks(number, np.take_along_axis(corners[k[one]], order[..., None], axis=1), dictionary)
+    order = (np.arange(4) + turn[every, None]) % 4
+    return Marks(number[every], np.take_along_axis(corners[every], order[..., None], axis=1), dictionary)
 
 
 # Sides by their first corner: twice four places along each, and depths outwards, in sides of the marker.
