@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.command_line import run
+from support.command_line import run, succeed
 from support.distorted import through
 from support.scenes import Scene, pinhole, random_flat_set, random_solid, table_1
 
@@ -185,12 +185,11 @@ def test_the_command_writes_a_file_of_each_method(method: str, tmp_path: Path) -
     points, camera = tmp_path / "points.csv", tmp_path / "camera.yaml"
     scene = random_flat_set(np.random.default_rng(11), 4, False)
     write_points(scene.points(0.1, np.random.default_rng(12)), points)
-    done = run("calibrate", points, "--method", method, "--no-skew", "-o", camera)
-    assert done.exit_code == 0, done.stderr
+    done = succeed("calibrate", points, "--method", method, "--no-skew", "-o", camera)
     assert ("does not minimise" in done.stderr) == (method != "nonlinear")
     again = read_calibration(camera)
     assert (again.method, again.trainer, again.network) == (method, "none", None)
-    assert run("evaluate", "camera", camera).exit_code == 0
+    succeed("evaluate", "camera", camera)
     refused = run("calibrate", points, "--method", method, "--trainer", "backprop")
     assert refused.exit_code == 2
     assert "--trainer backprop needs --method neuro" in refused.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.sessions import SIZE, camera, session
@@ -116,12 +116,10 @@ def test_new_points_tell_the_same_in_words(old: Calibration, tmp_path: Path) -> 
 def test_the_command_answers_by_its_exit_status(tmp_path: Path) -> None:
     names = ("flat", "stereo_left", "stereo_right")
     for name in names:
-        done = run("-qq", "calibrate", SAMPLES / f"{name}.csv", "--target", "given", "--distortion", "none",
-                   "-o", tmp_path / f"{name}.yaml")  # fmt: skip
-        assert done.exit_code == 0
+        succeed("-qq", "calibrate", SAMPLES / f"{name}.csv", "--target", "given", "--distortion", "none",
+                "-o", tmp_path / f"{name}.yaml")  # fmt: skip
     flat, left, right = (tmp_path / f"{name}.yaml" for name in names)
-    same = run("drift", flat, left, "--plot", tmp_path / "drift.png")
-    assert same.exit_code == 0
+    same = succeed("drift", flat, left, "--plot", tmp_path / "drift.png")
     assert "the same within chance" in same.stdout
     assert (tmp_path / "drift.png").stat().st_size > 10_000
     other = run("drift", flat, right)

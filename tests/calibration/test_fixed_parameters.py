@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.verdicts import verdict_on
 from support.wrong_inputs import CAMERA, flat
 
@@ -134,8 +134,7 @@ def test_values_that_no_camera_has(value: Any) -> None:
 
 def test_the_option(tmp_path: Path) -> None:
     flat_csv, output = str(SAMPLES / "flat.csv"), str(tmp_path / "camera.json")
-    done = run("calibrate", flat_csv, "--fix", "u0=321.8", "--fix", "theta=90", "-o", output)
-    assert done.exit_code == 0
+    done = succeed("calibrate", flat_csv, "--fix", "u0=321.8", "--fix", "theta=90", "-o", output)
     assert "type 1 (nothing given but u0)" in done.stderr
     parameters = json.loads(Path(output).read_text())["neurocal"]["parameters"]
     assert parameters["u0"] == {"value": 321.8, "std": 0, "fixed": True}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.verdicts import verdict_on
 from support.wrong_inputs import CAMERA, flat
 
@@ -134,8 +134,7 @@ def test_advice_counts_what_both_rows_of_pixels_say_about_the_one_alpha() -> Non
 
 def test_the_command_has_it(tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
-    told = run("calibrate", SAMPLES / "flat.csv", "--square-pixels", "-o", out)
-    assert told.exit_code == 0
+    told = succeed("calibrate", SAMPLES / "flat.csv", "--square-pixels", "-o", out)
     assert "square pixels" in told.stderr
     assert "square_pixels: true" in out.read_text()
     for more in (("--skew", "auto"), ("--method", "linear"), ("--distortion", "plumb-line")):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.surveyed import K, surveyed
@@ -171,8 +171,7 @@ def test_both_cameras_of_a_rig_see_the_same_survey() -> None:
 def test_the_columns_go_through_the_commands(tmp_path: Path) -> None:
     points, camera, again = tmp_path / "points.csv", tmp_path / "camera.yaml", tmp_path / "again.csv"
     write_points(surveyed(8)[0], points)
-    done = run("calibrate", points, "--distortion", "none", "-o", camera)
-    assert done.exit_code == 0
+    done = succeed("calibrate", points, "--distortion", "none", "-o", camera)
     assert "surveyed points: found" in done.stderr
     stored = read_calibration(camera)
     assert stored.points.world_std is not None
@@ -180,7 +179,7 @@ def test_the_columns_go_through_the_commands(tmp_path: Path) -> None:
     assert stored.target is not None
     assert stored.target.stated is not None
     assert stored.verdict == calibrate(surveyed(8)[0], distortion="none").verdict
-    assert run("convert", points, "--to", "neurocal", "-o", again).exit_code == 0
+    succeed("convert", points, "--to", "neurocal", "-o", again)
     assert again.read_text() == points.read_text()
     held = run("calibrate", points, "--distortion", "none", "--target", "given", "-o", tmp_path / "g.yaml")
     assert held.stderr.count("sX,sY,sZ") == 1

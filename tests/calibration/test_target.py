@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
@@ -148,8 +148,7 @@ def test_the_command_writes_the_board_and_its_picture(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     write_calibration(bent(), tmp_path / "c.yaml")
     places = ["-o", tmp_path / "board.yaml", "--plot", tmp_path / "board.png"]
-    result = run("target", tmp_path / "c.yaml", *places)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("target", tmp_path / "c.yaml", *places)
     assert re.search(r"bent by 0\.(5[89]|6)", result.stderr)
     assert (tmp_path / "board.png").read_bytes().startswith(b"\x89PNG")
     assert "points:" in (tmp_path / "board.yaml").read_text(encoding="utf-8")
@@ -162,8 +161,7 @@ def test_points_taken_where_they_were_found_are_told(tmp_path: Path) -> None:
 
 
 def test_a_target_as_given_is_nothing_to_write(tmp_path: Path) -> None:
-    camera = run("calibrate", SAMPLE, "--target", "given", "-o", tmp_path / "c.yaml")
-    assert camera.exit_code == 0, camera.stderr
+    succeed("calibrate", SAMPLE, "--target", "given", "-o", tmp_path / "c.yaml")
     result = run("target", tmp_path / "c.yaml")
     assert result.exit_code == 1
     assert "--target free" in result.stderr
@@ -274,12 +272,11 @@ def test_real_pairs_of_one_board(kind: str, tmp_path: Path, real_files: RealFile
     for side in ("left", "right"):
         images = real_files(f"opencv_stereo/{side}??.jpg")
         words = ["--cols", 9, "--rows", 6, "--square", 25, "--points", kind, "-o", tmp_path / f"{side}.csv"]
-        assert run("detect", *images, *words).exit_code == 0
+        succeed("detect", *images, *words)
     rms, baseline = {}, {}
     for target in ("given", "auto"):
         points = tmp_path / "left.csv", tmp_path / "right.csv"
-        result = run("stereo", *points, "--target", target, "--no-skew", "-o", tmp_path / "rig.yaml")
-        assert result.exit_code == 0, result.stderr
+        succeed("stereo", *points, "--target", target, "--no-skew", "-o", tmp_path / "rig.yaml")
         from neurocal_cli.files.rig_yaml import read_stereo_rig
 
         rig = read_stereo_rig(tmp_path / "rig.yaml")
@@ -305,10 +302,9 @@ def test_a_corner_rig_of_three_boards(kind: str, tmp_path: Path, real_files: Rea
     for side in ("left", "right"):
         (image,) = real_files(f"ortho3/{side}_calib.jpg")
         words = ["--board", tmp_path / "board.yaml", "--points", kind, "-o", tmp_path / f"{side}.csv"]
-        assert run("detect", image, *words).exit_code == 0
+        succeed("detect", image, *words)
     points = tmp_path / "left.csv", tmp_path / "right.csv"
-    result = run("stereo", *points, "-o", tmp_path / "rig.yaml")
-    assert result.exit_code == 0, result.stderr
+    succeed("stereo", *points, "-o", tmp_path / "rig.yaml")
     rig = read_stereo_rig(tmp_path / "rig.yaml")
     assert rig.rmse_px < 0.7
     assert rig.baseline == pytest.approx(230.9, abs=2.5)
@@ -322,7 +318,7 @@ def test_a_board_at_the_limit_of_stretch_is_kept_when_its_lens_is_chosen_anew(
     """Its sides lean by 0.02 rad, which is no stretch: held out, 0.13 px instead of 0.24."""
     images = real_files("sony_chess/frame*.jpg")
     words = ["--cols", 4, "--rows", 6, "--square", 30, "--points", "vertices", "-o", tmp_path / "points.csv"]
-    assert run("detect", *images, *words).exit_code == 0
+    succeed("detect", *images, *words)
     found = calibrate(read_points(tmp_path / "points.csv"))
     assert found.target is not None
     assert found.rmse_px < 0.09
@@ -334,7 +330,7 @@ def test_a_board_is_measured_though_the_rays_of_its_lens_do_not_meet(
 ) -> None:
     """As given, its error is 0.36 px, of which such rays explain a third."""
     words = ["--cols", 6, "--rows", 8, "--square", 32.5, "-o", tmp_path / "points.csv"]
-    assert run("detect", *real_files("fisheye_ocam/*.jpg"), *words).exit_code == 0
+    succeed("detect", *real_files("fisheye_ocam/*.jpg"), *words)
     found = calibrate(read_points(tmp_path / "points.csv"))
     assert found.target is not None
     assert found.rmse_px < 0.22
@@ -362,7 +358,7 @@ def test_boards_in_photographs_lean_as_much_as_they_are_stretched(
 ) -> None:
     """With axes of the image that are known to be at right angles, which look like a board that leans."""
     words = ["--cols", cols, "--rows", rows, "--square", square, "--points", "vertices"]
-    assert run("detect", *real_files(images), *words, "-o", tmp_path / "points.csv").exit_code == 0
+    succeed("detect", *real_files(images), *words, "-o", tmp_path / "points.csv")
     target = calibrate(read_points(tmp_path / "points.csv"), skew=False).target
     assert target is not None
     places = np.column_stack([target.given, np.ones(len(target.given))])

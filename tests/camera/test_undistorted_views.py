@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.command_line import run
+from support.command_line import run, succeed
 from support.slow_cases import slow_but
 from support.wide_cameras import SIZE, WIDE_LENSES, wide_camera, wide_points
 
@@ -194,8 +194,7 @@ def camera(tmp_path: Path) -> Path:
 def test_the_command_says_what_is_lost(camera: Path, tmp_path: Path) -> None:
     image = np.random.default_rng(0).integers(0, 255, SIZE[::-1], dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), image)
-    result = run("undistort", camera, tmp_path / "a.png", "-o", tmp_path / "plane.png")
-    assert result.exit_code == 0
+    result = succeed("undistort", camera, tmp_path / "a.png", "-o", tmp_path / "plane.png")
     whole = field_of_view(wide_camera("double_sphere"), SIZE).degrees[0]
     plane = 2 * np.degrees(np.arctan(500 / (250 / 0.9)))
     assert f"a plane shows {plane:.0f} of the {whole:.0f} degrees from left to right" in result.stderr
@@ -232,8 +231,7 @@ def test_tables_need_no_image(camera: Path, tmp_path: Path) -> None:
 def test_points_that_no_plane_shows_are_counted(camera: Path, tmp_path: Path) -> None:
     pixels = wide_camera("double_sphere").project(np.array([[0.1, 0.2, 1], [1, 0.1, -0.03]]))[0]
     write_points(Correspondences(np.zeros((2, 3)), pixels, image_size=SIZE), tmp_path / "p.csv")
-    result = run("undistort", camera, tmp_path / "p.csv", "-o", tmp_path / "out.csv")
-    assert result.exit_code == 0
+    result = succeed("undistort", camera, tmp_path / "p.csv", "-o", tmp_path / "out.csv")
     assert "1 of 2 points are left out, which are 90 degrees from the axis or more" in result.stderr
     assert len(read_points(tmp_path / "out.csv")) == 1
     assert (

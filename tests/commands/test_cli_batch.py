@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.sessions import camera, session
 
@@ -170,10 +170,9 @@ def fleet(folder: Path, seed: int, n: int, drifted: Sequence[int] = ()) -> Path:
 def test_a_camera_that_drifted_is_named_and_no_other(tmp_path: Path) -> None:
     options = ("--set", "distortion=k1k2", "--set", "target=given", "--set", "outliers=keep", "--jobs", 2)
     first, second = fleet(tmp_path / "one", 1, 2), fleet(tmp_path / "two", 2, 2, drifted=[1])
-    assert run("batch", first, *options, "-o", tmp_path / "first").exit_code == 0
+    succeed("batch", first, *options, "-o", tmp_path / "first")
     against = tmp_path / "first" / "summary.csv"
-    done = run("batch", second, *options, "--against", against, "-o", tmp_path / "second")
-    assert done.exit_code == 0, done.stderr
+    done = succeed("batch", second, *options, "--against", against, "-o", tmp_path / "second")
     assert "warning: cam001: has changed" in done.stderr
     assert {row["name"]: row["drift"] for row in rows_of(tmp_path / "second")} == {
         f"cam{k:03d}": "changed" if k == 1 else "same" for k in range(2)

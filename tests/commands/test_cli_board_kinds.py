@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.marked import marked_scene
 
 from neurocal_cli import read_board, read_points
@@ -27,8 +27,7 @@ DPI = 100
 )
 def test_a_printed_board_is_found_by_its_file(tmp_path: Path, form: str, points: int) -> None:
     picture = tmp_path / "board.png"
-    result = run("board", "--board", form, "--dpi", DPI, "-o", picture)
-    assert result.exit_code == 0, result.stderr
+    succeed("board", "--board", form, "--dpi", DPI, "-o", picture)
     board = read_board(tmp_path / "board.yaml")
     image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
     assert image is not None
@@ -49,11 +48,11 @@ def test_a_printed_board_is_found_by_its_file(tmp_path: Path, form: str, points:
 def test_a_printed_grid_of_aruco_markers_is_measured_at_its_edges(tmp_path: Path) -> None:
     picture, points = tmp_path / "board.png", tmp_path / "p.csv"
     form = "arucogrid:4x3:30:0.25:DICT_4X4_50"
-    assert run("board", "--board", form, "--dpi", DPI, "-o", picture).exit_code == 0
+    succeed("board", "--board", form, "--dpi", DPI, "-o", picture)
     image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     cv2.imwrite(str(picture), cv2.GaussianBlur(image, (0, 0), 0.7))
-    assert run("detect", picture, "--board", tmp_path / "board.yaml", "-o", points).exit_code == 0
+    succeed("detect", picture, "--board", tmp_path / "board.yaml", "-o", points)
     found = read_points(points)
     assert len(found) == 4 * 12
     assert found.point is not None
@@ -72,8 +71,7 @@ def test_a_printed_board_is_found_without_a_description(tmp_path: Path) -> None:
     image = cv2.copyMakeBorder(image, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=(90,))
     cv2.imwrite(str(picture), cv2.GaussianBlur(image, (0, 0), 0.7))
     words = "--points", "vertices", "--save-board", found, "-o", tmp_path / "p.csv"
-    result = run("detect", picture, *words)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("detect", picture, *words)
     said = "found a ChArUco board of 6 x 4 squares, markers of 0.8 of a square, DICT_5X5_50 from 0 on"
     assert result.stderr.splitlines()[0] == said
     assert "the side of a square is not given, so it is the unit of all lengths" in result.stderr
@@ -95,8 +93,7 @@ def test_a_printed_board_is_found_without_a_description(tmp_path: Path) -> None:
 def test_circles_are_printed_at_their_places_in_all_formats(tmp_path: Path) -> None:
     form = "asymmetric_circles:4x5:20"
     for name in ("b.svg", "b.pdf", "b.png"):
-        result = run("board", "--board", form, "--dpi", DPI, "-o", tmp_path / name)
-        assert result.exit_code == 0, result.stderr
+        succeed("board", "--board", form, "--dpi", DPI, "-o", tmp_path / name)
     (plane,) = read_board(tmp_path / "b.yaml").planes
     assert isinstance(plane, CirclePlane)
     assert plane.diameter == pytest.approx(0.6 * np.sqrt(2) * 20, abs=1e-3)
@@ -151,18 +148,16 @@ def test_the_shape_of_a_board_is_written_in_its_own_kind(tmp_path: Path) -> None
     points.write_text("\n".join([*head, *rows, ""]))
     result = run("calibrate", points, "--target", "free", "-o", camera)
     assert camera.exists(), result.stderr
-    result = run("target", camera, "-o", tmp_path / "shape.yaml")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("target", camera, "-o", tmp_path / "shape.yaml")
     (found,) = read_board(tmp_path / "shape.yaml").planes
     assert found.markers == plane.markers
     assert len(found.measured) == len(world)
 
 
 def test_boards_of_a_rig_have_different_markers(tmp_path: Path) -> None:
-    result = run(
+    result = succeed(
         "board", "--board", "charuco:6x5:20:15", "--boards", 4, "--dpi", 50, "-o", tmp_path / "rig.png"
     )
-    assert result.exit_code == 0, result.stderr
     boards = [read_board(tmp_path / f"rig_{k}.yaml") for k in (1, 2, 3, 4)]
     markers = [board.planes[0].markers for board in boards]
     assert [one.first_id for one in markers if one] == [0, 15, 30, 45]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
-from support.command_line import run
+from support.command_line import run, succeed
 from support.made_calibration import CAMERA, made_calibration, made_points
 from support.places import SAMPLES
 
@@ -91,13 +91,13 @@ def test_several_files_are_calibrated_as_one(tmp_path: Path) -> None:
         files.append(tmp_path / f"{k}.csv")
         write_points(both.select(both.view_index == k), files[-1])
     out = tmp_path / "camera.yaml"
-    assert run("calibrate", *files, "-o", out).exit_code == 0
+    succeed("calibrate", *files, "-o", out)
     assert list(read_calibration(out).views) == ["view00", "view01"]
 
 
 def test_no_skew_holds_theta_at_a_right_angle(points: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
-    assert run("calibrate", points, "--no-skew", "-o", out).exit_code == 0
+    succeed("calibrate", points, "--no-skew", "-o", out)
     found = read_calibration(out)
     assert not found.intrinsics.skewed
     assert "theta" in found.fixed
@@ -160,8 +160,7 @@ def test_no_points_is_a_usage_error() -> None:
 
 def test_type_2_takes_the_centre_of_the_option(points: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
-    result = run("calibrate", points, "--type", 2, "--image-center", 320, 240, "-o", out)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("calibrate", points, "--type", 2, "--image-center", 320, 240, "-o", out)
     found = read_calibration(out)
     assert (found.intrinsics.u0, found.intrinsics.v0) == (320, 240)
     assert found.fixed >= {"u0", "v0"}
@@ -193,8 +192,7 @@ def test_type_2_without_any_centre_is_a_usage_error(tmp_path: Path) -> None:
 def test_type_3_finds_the_pose_of_a_known_camera(tmp_path: Path, camera: Path) -> None:
     write_points(replace(made_points(1, first=3), image_size=None), tmp_path / "moved.csv")
     out = tmp_path / "camera.yaml"
-    result = run("calibrate", tmp_path / "moved.csv", "--type", 3, "--intrinsics", camera, "-o", out)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("calibrate", tmp_path / "moved.csv", "--type", 3, "--intrinsics", camera, "-o", out)
     found = read_calibration(out)
     assert found.intrinsics == CAMERA
     assert found.image_size == (640, 480)
@@ -203,8 +201,7 @@ def test_type_3_finds_the_pose_of_a_known_camera(tmp_path: Path, camera: Path) -
 
 def test_type_4_finds_the_camera_of_a_known_pose(tmp_path: Path, points: Path, camera: Path) -> None:
     out = tmp_path / "camera.yaml"
-    result = run("calibrate", points, "--type", 4, "--extrinsics", camera, "-o", out)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("calibrate", points, "--type", 4, "--extrinsics", camera, "-o", out)
     assert read_calibration(out).views["view00"].fixed
     assert sum(line.endswith("fixed") for line in result.stderr.splitlines()) == 6
 
@@ -216,8 +213,7 @@ def test_type_3_keeps_the_lens_of_a_ros_file(tmp_path: Path, points: Path) -> No
         "data: [600, 0, 320, 0, 600, 240, 0, 0, 1]}\ndistortion_model: plumb_bob\n"
         "distortion_coefficients: {rows: 1, cols: 5, data: [-0.05, 0, 0, 0, 0]}\n"
     )
-    result = run("calibrate", points, "--type", 3, "--intrinsics", ros, "-o", out)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("calibrate", points, "--type", 3, "--intrinsics", ros, "-o", out)
     assert read_calibration(out).distortion.tolist() == [-0.05, 0, 0, 0, 0]
     assert "k1  " in result.stderr
 
@@ -327,7 +323,7 @@ def test_debugging_shows_where_an_unexpected_error_arose(
 @pytest.mark.slow
 def test_the_plot_is_drawn(points: Path, tmp_path: Path) -> None:
     picture = tmp_path / "picture.png"
-    assert run("calibrate", points, "--plot", picture).exit_code == 0
+    succeed("calibrate", points, "--plot", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 
 from neurocal_cli import Board, read_image, read_points
@@ -284,8 +284,7 @@ def test_the_reason_of_a_single_image_is_the_error(tmp_path: Path, quiet: list[s
 
 
 def test_an_image_comes_from_stdin(folder: Path) -> None:
-    result = run("detect", "-", *BOARD, stdin=(folder / "board02.png").read_bytes())
-    assert result.exit_code == 0
+    result = succeed("detect", "-", *BOARD, stdin=(folder / "board02.png").read_bytes())
     assert "\nstdin,h:0:0," in result.stdout
 
 
@@ -341,8 +340,7 @@ def test_opencv_is_loaded_for_images_only(words: list[str]) -> None:
 def test_detected_points_calibrate_the_camera(tmp_path: Path) -> None:
     points = tmp_path / "points.csv"
     assert detect(f"{SAMPLES}/board*.png", *BOARD, "-o", points).exit_code == 0
-    result = run("calibrate", points, "-o", tmp_path / "camera.yaml")
-    assert result.exit_code == 0
+    succeed("calibrate", points, "-o", tmp_path / "camera.yaml")
     from neurocal_cli import read_calibration
 
     camera = read_calibration(tmp_path / "camera.yaml")
@@ -373,8 +371,7 @@ def test_without_the_side_of_a_square_it_is_the_unit(folder: Path) -> None:
 
 
 def test_a_board_is_found_in_an_image_from_standard_input(folder: Path) -> None:
-    result = run("detect", "-", "--square", 25, stdin=(folder / "board01.png").read_bytes())
-    assert result.exit_code == 0
+    result = succeed("detect", "-", "--square", 25, stdin=(folder / "board01.png").read_bytes())
     assert "\nstdin,h:0:0,12.5,0.0,0.0," in result.stdout
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
@@ -39,8 +39,7 @@ def looked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_an_image_that_was_seen_is_not_looked_at_again(tmp_path: Path, looked: list[str]) -> None:
     (tmp_path / "none.png").write_bytes(cv2.imencode(".png", np.full((300, 400), 128, np.uint8))[1])
     words = ["detect", *IMAGES[:2], tmp_path / "none.png", *BOARD, "--jobs", 1]
-    first = run(*words, "--cache", tmp_path / "cache")
-    assert first.exit_code == 0, first.stderr
+    first = succeed(*words, "--cache", tmp_path / "cache")
     assert looked == ["board01.png", "board02.png", "none.png"]
     assert len(list((tmp_path / "cache").iterdir())) == 3
     again = run(*words, "--cache", tmp_path / "cache")
@@ -79,7 +78,7 @@ def test_a_run_that_was_stopped_goes_on(
     assert run(*words).exit_code == 130
     assert not (tmp_path / "p.csv").exists()
     monkeypatch.setattr(batch, "_detected", counted)
-    assert run(*words).exit_code == 0
+    succeed(*words)
     assert looked == ["board01.png", "board02.png", "board03.png"]
     assert read_points([tmp_path / "p.csv"]).n_views == 3
 
@@ -110,8 +109,7 @@ def test_a_cache_that_cannot_be_written_to_costs_no_detection(tmp_path: Path) ->
     (file,) = (tmp_path / "cache").iterdir()
     file.unlink()
     file.mkdir()
-    again = run(*words)
-    assert again.exit_code == 0
+    again = succeed(*words)
     assert again.stdout == first.stdout
     assert "the detection is not cached: " in again.stderr
 
@@ -136,8 +134,7 @@ def film(path: Path, fourcc: str) -> None:
 )
 def test_a_video_gives_its_sharp_and_different_frames(ending: str, fourcc: str, tmp_path: Path) -> None:
     film(tmp_path / f"clip.{ending}", fourcc)
-    result = run("detect", tmp_path / f"clip.{ending}", *BOARD, "-o", tmp_path / "points.csv")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("detect", tmp_path / f"clip.{ending}", *BOARD, "-o", tmp_path / "points.csv")
     assert "3 of 78 frames are sharp and differ" in result.stderr
     points = read_points([tmp_path / "points.csv"])
     numbers = [int(name.removeprefix("clip_")) for name in points.view_names]
@@ -150,7 +147,7 @@ def test_a_video_gives_its_sharp_and_different_frames(ending: str, fourcc: str, 
 
 
 def _points_of(images: tuple[Path, ...], folder: Path) -> Path:
-    assert run("detect", *images, *BOARD, "-o", folder / "truth.csv").exit_code == 0
+    succeed("detect", *images, *BOARD, "-o", folder / "truth.csv")
     return folder / "truth.csv"
 
 
@@ -188,8 +185,7 @@ def test_a_folder_is_watched_until_no_more_images_come(
         pause(seconds)
 
     monkeypatch.setattr(frames.time, "sleep", copy_one)
-    result = run("detect", folder, *BOARD, "--watch", 0.5, "-o", tmp_path / "points.csv")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("detect", folder, *BOARD, "--watch", 0.5, "-o", tmp_path / "points.csv")
     lines = result.stderr.splitlines()
     assert lines[0].startswith("board01.png: 93 points, 1 view: no camera yet: ")
     assert any(line.startswith("board03.png: 93 points, 3 views: rms 0.0") for line in lines)
@@ -206,8 +202,7 @@ def test_the_watch_goes_on_past_as_many_images_of_another_size(tmp_path: Path) -
     folder.mkdir()
     for name in ("board01.png", "photo01.jpg", "photo02.jpg"):
         (folder / name).write_bytes((SAMPLES / name).read_bytes())
-    result = run("detect", folder, *BOARD, "--watch", 0.5, "-o", tmp_path / "points.csv")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("detect", folder, *BOARD, "--watch", 0.5, "-o", tmp_path / "points.csv")
     assert "as many have" in result.stderr
     assert "2 of 3 images" in result.stderr
 
@@ -218,8 +213,7 @@ def test_the_watch_goes_on_past_names_that_cannot_be_those_of_views(tmp_path: Pa
     for name in ("board01.png", "board01.PNG", "a\nb.png"):
         (folder / name).write_bytes((SAMPLES / "board01.png").read_bytes())
     points = tmp_path / "points.csv"
-    result = run("detect", folder, *BOARD, "--watch", 0.5, "-o", points)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("detect", folder, *BOARD, "--watch", 0.5, "-o", points)
     assert "would both be the view 'board01'; rename one of them; it is left out" in result.stderr
     assert "b.png has a line break in its name; rename it; it is left out" in result.stderr
     assert "1 of 1 images" in result.stderr
@@ -242,6 +236,5 @@ def test_an_interrupt_ends_the_watch_and_the_points_are_written(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(frames.time, "sleep", interrupt)
-    result = run("detect", IMAGES[0], *BOARD, "--watch", 60, "-o", tmp_path / "points.csv")
-    assert result.exit_code == 0, result.stderr
+    succeed("detect", IMAGES[0], *BOARD, "--watch", 60, "-o", tmp_path / "points.csv")
     assert read_points([tmp_path / "points.csv"]).n_points == 93

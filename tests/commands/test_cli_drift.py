@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 
 from neurocal_cli import Pose
@@ -18,14 +18,13 @@ from neurocal_cli.files.rig_yaml import format_stereo_rig, read_stereo_rig
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("drift") / "rig.yaml"
     sides = [SAMPLES / f"stereo_{side}.csv" for side in ("left", "right")]
-    assert run("stereo", *sides, "--distortion", "k1", "-o", file).exit_code == 0
+    succeed("stereo", *sides, "--distortion", "k1", "-o", file)
     return file
 
 
 def test_a_rig_is_the_same_as_itself_also_from_a_pipe(rig: Path, tmp_path: Path) -> None:
     picture = tmp_path / "drift.png"
-    found = run("drift", "-", rig, "--plot", picture, stdin=rig.read_bytes())
-    assert found.exit_code == 0, found.output
+    found = succeed("drift", "-", rig, "--plot", picture, stdin=rig.read_bytes())
     assert "the same within chance" in found.output
     assert picture.stat().st_size > 10_000
 
@@ -53,7 +52,7 @@ def test_a_camera_that_moved_is_named_and_the_exit_status_is_4(rig: Path, tmp_pa
 
 def test_a_rig_and_a_camera_are_not_compared(rig: Path, tmp_path: Path) -> None:
     camera = tmp_path / "camera.yaml"
-    assert run("calibrate", SAMPLES / "stereo_left.csv", "--distortion", "k1", "-o", camera).exit_code == 0
+    succeed("calibrate", SAMPLES / "stereo_left.csv", "--distortion", "k1", "-o", camera)
     found = run("drift", rig, camera)
     assert found.exit_code == 1
     assert "give two of a kind" in found.stderr

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import pytest
 from man_pages import man_pages
-from support.command_line import commands, run
+from support.command_line import commands, run, succeed
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
@@ -26,8 +26,7 @@ COMMANDS = [pytest.param(words, command, id=" ".join(["neurocal", *words])) for 
 
 @pytest.mark.parametrize(("words", "command"), COMMANDS)
 def test_help_ends_with_an_example(words: list[str], command: click.Command) -> None:
-    result = run(*words, "--help")
-    assert result.exit_code == 0
+    result = succeed(*words, "--help")
     assert result.stderr == ""
     assert command.help is not None
     last = inspect.cleandoc(command.help).split("\n\n")[-1]

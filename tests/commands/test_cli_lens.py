@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 from simulated_zoom import write_lens_points
-from support.command_line import run
+from support.command_line import run, succeed
 from support.zoom_laws import FLOOR, between, grid, seen
 
 from neurocal_cli.calibration.zoom.fit import fit_lens
@@ -42,8 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_lens_points(seen("c", between(4, 3), seed=2, side=4), folder / "between.csv")
     (folder / "cameras.csv").write_text(CAMERAS)
     words = ("--distortion", "none", "--hidden", 0, 0, "-o", folder / "lens.yaml")
-    result = run("lens", "fit", folder / "points.csv", *words)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("lens", "fit", folder / "points.csv", *words)
     (folder / "report.txt").write_text(result.stderr)
     return folder
 
@@ -103,10 +102,8 @@ def test_a_camera_at_a_setting_chains_into_evaluate(folder: Path) -> None:
     one = folder / "one.csv"
     setting = between(4, 3)[2]
     write_lens_points(seen("c", setting[None], seed=3, side=4), one)
-    camera = run("lens", "camera", folder / "lens.yaml", "--zoom", setting[0], "--focus", setting[1])
-    assert camera.exit_code == 0, camera.stderr
-    result = run("evaluate", "camera", "-", one, "--json", stdin=camera.stdout.encode())
-    assert result.exit_code == 0, result.stderr
+    camera = succeed("lens", "camera", folder / "lens.yaml", "--zoom", setting[0], "--focus", setting[1])
+    result = succeed("evaluate", "camera", "-", one, "--json", stdin=camera.stdout.encode())
     assert json.loads(result.stdout)["rmse_px"] < 1.2 * FLOOR
     (folder / "camera.yaml").write_text(camera.stdout)
     calibration = read_calibration(folder / "camera.yaml")
@@ -131,15 +128,13 @@ def test_outside_the_range_is_an_error_or_a_warning(folder: Path) -> None:
     assert result.stderr.count("\n") == 1
     assert "100 to 2100" in result.stderr
     assert not out.exists()
-    result = run(*words, "--extrapolate")
-    assert result.exit_code == 0
+    result = succeed(*words, "--extrapolate")
     assert "warning: zoom 2200 is outside" in result.stderr
     assert read_calibration(out).warnings
 
 
 def test_evaluate_prints_the_contract_s_keys(folder: Path) -> None:
-    result = run("lens", "evaluate", folder / "lens.yaml", folder / "between.csv", "--json")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("lens", "evaluate", folder / "lens.yaml", folder / "between.csv", "--json")
     found = json.loads(result.stdout)
     assert {"n_points", "rmse_px", "max_px", "settings", "rivals"} <= set(found)
     assert found["n_points"] == 6 * 32
@@ -156,10 +151,9 @@ def test_evaluate_prints_the_contract_s_keys(folder: Path) -> None:
 
 def test_pictures_are_drawn(folder: Path) -> None:
     words = ("lens", "evaluate", folder / "lens.yaml", folder / "between.csv", "--plot")
-    result = run(*words, folder / "evaluate.svg")
-    assert result.exit_code == 0, result.stderr
+    succeed(*words, folder / "evaluate.svg")
     fit = ("lens", "fit", folder / "cameras.csv", "--hidden", 0, 0, "-o", folder / "drawn.yaml")
-    assert run(*fit, "--plot", folder / "fit.png").exit_code == 0
+    succeed(*fit, "--plot", folder / "fit.png")
     for name in ("fit.png", "evaluate.svg"):
         assert (folder / name).stat().st_size > 10_000
     assert run(*words, folder / "x.txt").exit_code == 2
@@ -169,8 +163,7 @@ def test_known_cameras_go_the_simple_path(folder: Path, known: Result) -> None:
     assert known.exit_code == 0, known.stderr
     assert "known cameras" in known.stderr
     assert "verdict: " in known.stderr
-    camera = run("lens", "camera", "-", "--zoom", 37, stdin=known.stdout.encode())
-    assert camera.exit_code == 0, camera.stderr
+    camera = succeed("lens", "camera", "-", "--zoom", 37, stdin=known.stdout.encode())
     (folder / "known.yaml").write_text(camera.stdout)
     calibration = read_calibration(folder / "known.yaml")
     assert calibration.intrinsics.alpha_u == pytest.approx(3710, rel=0.01)
@@ -194,8 +187,7 @@ def test_calibration_files_that_a_table_names_go_the_simple_path(folder: Path) -
         write_camera(folder / "files" / f"at{zoom}.yml", zoom, f"{-0.4 + 0.005 * zoom}, 0.1, 0., 0., 0.")
         lines.append(f"{zoom},files/at{zoom}.yml")
     (folder / "files.csv").write_text("\n".join(lines) + "\n")
-    result = run("lens", "fit", folder / "files.csv", "--hidden", 0, 0, "-o", folder / "files.yaml")
-    assert result.exit_code == 0, result.stderr
+    succeed("lens", "fit", folder / "files.csv", "--hidden", 0, 0, "-o", folder / "files.yaml")
     camera = run("lens", "camera", folder / "files.yaml", "--zoom", 37)
     (folder / "at37.yaml").write_text(camera.stdout)
     calibration = read_calibration(folder / "at37.yaml")

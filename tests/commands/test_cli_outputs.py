@@ -10,7 +10,7 @@ from threading import Thread
 from typing import NoReturn
 
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
@@ -25,9 +25,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).write_bytes((SAMPLES / name).read_bytes())
     (folder / "points").write_bytes((folder / "flat.csv").read_bytes())
     quick = ("--no-skew", "--distortion", "none", "--outliers", "keep")
-    assert run("calibrate", folder / "flat.csv", *quick, "-o", folder / "camera.yaml").exit_code == 0
+    succeed("calibrate", folder / "flat.csv", *quick, "-o", folder / "camera.yaml")
     left, right = folder / "stereo_left.csv", folder / "stereo_right.csv"
-    assert run("stereo", left, right, *quick, "-o", folder / "rig.yaml").exit_code == 0
+    succeed("stereo", left, right, *quick, "-o", folder / "rig.yaml")
     return folder
 
 
@@ -302,8 +302,7 @@ def test_an_interrupt_while_results_get_their_names_comes_too_late(
 
     monkeypatch.setattr("os.replace", interrupted_move)
     monkeypatch.chdir(made)
-    result = run("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", tmp_path / "new")
-    assert result.exit_code == 0
+    succeed("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", tmp_path / "new")
     assert len(list((tmp_path / "new").iterdir())) == 2
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

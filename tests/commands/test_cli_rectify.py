@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.real_data import RealFiles
 from support.rigs import random_rig, sides
 from support.slow_cases import slow_but
@@ -83,8 +83,7 @@ def test_the_maps_are_those_of_opencv(lens: Distortion, alpha: float | None, tmp
     """The same R1, R2, P1, P2 given to OpenCV lead to the same source of each pixel."""
     (tmp_path / "rig.yaml").write_text(str(FORMATS["neurocal"].text(camera_set(lens), "")[""]))
     words = [] if alpha is None else ["--alpha", alpha]
-    result = run("rectify", tmp_path / "rig.yaml", "--maps", *words, "-o", tmp_path / "out")
-    assert result.exit_code == 0, result.stderr
+    succeed("rectify", tmp_path / "rig.yaml", "--maps", *words, "-o", tmp_path / "out")
     found = dict(np.load(tmp_path / "out" / "maps.npz"))
     of = cv2.fisheye.initUndistortRectifyMap if lens is FISH else cv2.initUndistortRectifyMap
     for k, (side, camera) in enumerate(
@@ -171,8 +170,7 @@ def test_images_are_those_of_opencv_s_remap(rig_file: Path, tmp_path: Path) -> N
                 str(tmp_path / name / f"{name}{k}.png"), np.round(picture(camera, pose)).astype(np.uint8)
             )
     words = [rig_file, tmp_path / "left", tmp_path / "right"]
-    result = run("rectify", *words, "--interpolation", "linear", "--side-by-side", "-o", tmp_path / "out")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("rectify", *words, "--interpolation", "linear", "--side-by-side", "-o", tmp_path / "out")
     assert result.stderr == "rectified 3 of 3 pairs\n"
     matrices = rectified_pair(as_stereo(cameras)).matrices
     pictures = []
@@ -195,8 +193,7 @@ def test_points_files_are_rectified(rig_file: Path, tmp_path: Path) -> None:
     for name, points in zip(("a", "b"), seen(camera_set(BENT), 0.1), strict=True):
         names.append(tmp_path / f"{name}.csv")
         write_points(points, names[-1])
-    result = run("rectify", rig_file, *names, "-o", tmp_path / "out")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("rectify", rig_file, *names, "-o", tmp_path / "out")
     left, right = (
         read_points(tmp_path / "out" / side / f"{name}.csv") for side, name in (("left", "a"), ("right", "b"))
     )
@@ -212,8 +209,7 @@ def test_points_that_do_not_fit_the_rig_are_warned_of(tmp_path: Path) -> None:
         write_points(points, tmp_path / f"{name}.csv")
     for other, said in (("right", False), ("twice", True)):
         files = tmp_path / "left.csv", tmp_path / f"{other}.csv"
-        result = run("rectify", tmp_path / "rig.yaml", *files, "-o", tmp_path / "out")
-        assert result.exit_code == 0, result.stderr
+        result = succeed("rectify", tmp_path / "rig.yaml", *files, "-o", tmp_path / "out")
         assert ("warning: most points do not fit the rig" in result.stderr) == said
 
 
@@ -255,8 +251,7 @@ def test_a_pair_of_another_size_is_named_and_left_out(rig_file: Path, tmp_path: 
     for name, size in (("l1", SIZE), ("r1", SIZE), ("l2", SIZE), ("r2", (100, 80))):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros(size[::-1], np.uint8))
     names = [tmp_path / f"{name}.png" for name in ("l1", "l2", "r1", "r2")]
-    result = run("rectify", rig_file, *names, "-o", tmp_path / "out")
-    assert result.exit_code == 0
+    result = succeed("rectify", rig_file, *names, "-o", tmp_path / "out")
     assert "r2.png: has 100 x 80 px" in result.stderr
     assert "rectified 1 of 2 pairs" in result.stderr
     assert not (tmp_path / "out" / "left" / "l2.png").exists()
@@ -291,9 +286,9 @@ def test_rows_of_real_rigs_agree(
     for side in ("left", "right"):
         images = real_files(f"{folder}/{side}[0-9]*.jpg")
         size = ["--cols", 9, "--rows", 6, "--square", square, "--points", kind]
-        assert run("detect", *images, *size, "-o", tmp_path / f"{side}.csv").exit_code == 0
+        succeed("detect", *images, *size, "-o", tmp_path / f"{side}.csv")
     points = [tmp_path / "left.csv", tmp_path / "right.csv"]
-    assert run("stereo", *points, *words, "-o", tmp_path / "rig.yaml").exit_code == 0
+    succeed("stereo", *points, *words, "-o", tmp_path / "rig.yaml")
     result = run("rectify", tmp_path / "rig.yaml", "--maps", "-o", tmp_path / "out")
     assert float(result.stderr.split("differ by ")[1].split()[0]) < limit
     rig = read_stereo_rig(tmp_path / "rig.yaml")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.made_calibration import made_calibration
 from support.places import SAMPLES
 from support.rigs import random_rig, sides
@@ -109,8 +109,7 @@ def test_no_text_of_a_file_can_become_html(tmp_path: Path) -> None:
         judgement=judged,
     )
     write_calibration(hostile, tmp_path / "evil.yaml")
-    result = run("report", tmp_path / "evil.yaml")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("report", tmp_path / "evil.yaml")
     page = Page(result.stdout)
     assert page.tags.count("script") == 1
     assert page.text.count("alert(1)") > 10
@@ -123,8 +122,7 @@ def test_the_same_file_gives_the_same_page(camera_file: Path) -> None:
 def test_a_rig_has_a_page(tmp_path: Path) -> None:
     rig = calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
     write_rig(rig, tmp_path / "rig.yaml")
-    result = run("report", tmp_path / "rig.yaml")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("report", tmp_path / "rig.yaml")
     page = Page(result.stdout)
     for shown in ("Calibration of 2 cameras", "R X_left", "Camera left", "Camera right", "neurocal stereo"):
         assert shown in page.text
@@ -133,8 +131,7 @@ def test_a_rig_has_a_page(tmp_path: Path) -> None:
 
 def test_a_lean_file_and_a_json_file_have_pages(tmp_path: Path) -> None:
     write_result(made_calibration(2), tmp_path / "lean.json", lean=True)
-    result = run("report", tmp_path / "lean.json")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("report", tmp_path / "lean.json")
     assert "Residuals" not in Page(result.stdout).text
 
 
@@ -153,8 +150,7 @@ def test_photographs_are_shown_under_the_residuals_within_3_mb(tmp_path: Path) -
     write_calibration(calibration, tmp_path / "camera.yaml")
     names = calibration.points.view_names
     folder = photographs(tmp_path / "images", names[1:])
-    result = run("report", tmp_path / "camera.yaml", "--images", folder)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("report", tmp_path / "camera.yaml", "--images", folder)
     assert result.stderr.startswith("note: no image of 1 views, such as view00, in ")
     assert len(result.stdout.encode()) < 3e6
     page = Page(result.stdout)
@@ -187,8 +183,7 @@ def test_points_left_out_are_crosses() -> None:
 def test_calibrate_makes_the_page_in_the_same_run_and_tells_how(tmp_path: Path) -> None:
     write_points(made_calibration(3).points, tmp_path / "my points.csv")
     words = ["calibrate", tmp_path / "my points.csv", "--no-skew", "-o", tmp_path / "camera.yaml"]
-    result = run(*words, "--html", tmp_path / "page.html")
-    assert result.exit_code == 0, result.stderr
+    result = succeed(*words, "--html", tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text())
     typed = (
         f"neurocal calibrate '{tmp_path / 'my points.csv'}' --no-skew -o {tmp_path / 'camera.yaml'} --html"
@@ -197,7 +192,7 @@ def test_calibrate_makes_the_page_in_the_same_run_and_tells_how(tmp_path: Path) 
     assert hashlib.sha256((tmp_path / "my points.csv").read_bytes()).hexdigest() in page.text
     assert f"numpy {np.__version__}" in page.text
     before = (tmp_path / "camera.yaml").read_bytes()
-    assert run(*words).exit_code == 0
+    succeed(*words)
     assert (tmp_path / "camera.yaml").read_bytes() == before
     same = run("report", tmp_path / "camera.yaml").stdout
     assert (
@@ -215,15 +210,13 @@ def test_stereo_makes_the_page_in_the_same_run(tmp_path: Path) -> None:
     write_points(left, tmp_path / "l.csv")
     write_points(right, tmp_path / "r.csv")
     words = ["stereo", tmp_path / "l.csv", tmp_path / "r.csv", "--no-skew", "-o", tmp_path / "rig.yaml"]
-    result = run(*words, "--html", tmp_path / "page.html")
-    assert result.exit_code == 0, result.stderr
+    result = succeed(*words, "--html", tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text())
     for name in ("l.csv", "r.csv"):
         assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() in page.text
     lefts, rights = (photographs(tmp_path / side, one.view_names, one.image_size or (0, 0))
                      for side, one in (("left", left), ("right", right)))  # fmt: skip
-    result = run("report", tmp_path / "rig.yaml", "--images", lefts, "--images", rights)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("report", tmp_path / "rig.yaml", "--images", lefts, "--images", rights)
     assert Page(result.stdout).tags.count("image") == left.n_views + right.n_views
     result = run("report", tmp_path / "rig.yaml", *["--images", lefts] * 3)
     assert (result.exit_code, result.stdout) == (2, "")
@@ -336,9 +329,8 @@ def test_another_file_is_refused(text: str, message: str, tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_a_zoom_lens_has_a_page(tmp_path: Path) -> None:
     zoom = SAMPLES / "zoom.csv"
-    assert run("lens", "fit", zoom, "-o", tmp_path / "lens.yaml").exit_code == 0
-    result = run("report", tmp_path / "lens.yaml")
-    assert result.exit_code == 0, result.stderr
+    succeed("lens", "fit", zoom, "-o", tmp_path / "lens.yaml")
+    result = succeed("report", tmp_path / "lens.yaml")
     assert "Calibration of a zoom lens" in Page(result.stdout).text
     assert (
         "zoom from 0 to 3000 from left to right and focus from 0 to 900 from top to bottom" in result.stdout

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.made_calibration import made_calibration
 from support.places import SAMPLES
 from support.rigs import random_rig
@@ -43,8 +43,7 @@ def test_pixels_move_as_the_image_does(
     camera: Path,
 ) -> None:
     out = camera.with_name("new.yaml")
-    result = run("resize", camera, *words, "-o", out)
-    assert result.exit_code == 0, result.stderr
+    succeed("resize", camera, *words, "-o", out)
     old, new = read_calibration(camera), read_calibration(out)
     assert new.image_size == size
     # The edges of a scaled image, -1/2 and w - 1/2, stay edges.
@@ -69,8 +68,8 @@ def test_the_resized_camera_is_that_of_resized_points(tmp_path: Path) -> None:
     write_points(half, tmp_path / "half.csv")
     for name, points in (("whole", SAMPLES / "flat.csv"), ("half", tmp_path / "half.csv")):
         words = ["--distortion", "k1", "--target", "given", "-o", tmp_path / f"{name}.yaml"]
-        assert run("calibrate", points, *words).exit_code == 0
-    assert run("resize", tmp_path / "whole.yaml", "--to", 320, 240, "-o", tmp_path / "r.yaml").exit_code == 0
+        succeed("calibrate", points, *words)
+    succeed("resize", tmp_path / "whole.yaml", "--to", 320, 240, "-o", tmp_path / "r.yaml")
     resized, expected = read_calibration(tmp_path / "r.yaml"), read_calibration(tmp_path / "half.yaml")
     assert np.abs(resized.K - expected.K).max() < 1e-3
     for name, std in expected.std.items():
@@ -84,15 +83,14 @@ def test_a_rig_is_resized(ending: str, tmp_path: Path) -> None:
     cameras = CameraSet((scene.camera(0), scene.camera(1)), (scene.rig,), unit="mm")
     write_rig(as_stereo(cameras), tmp_path / f"rig.{ending}")
     out = tmp_path / f"half.{ending}"
-    result = run("resize", tmp_path / f"rig.{ending}", "--scale", 0.5, "-o", out)
-    assert result.exit_code == 0, result.stderr
+    succeed("resize", tmp_path / f"rig.{ending}", "--scale", 0.5, "-o", out)
     old, new = read_stereo_rig(tmp_path / f"rig.{ending}"), read_stereo_rig(out)
     assert np.array_equal(new.pose.D, old.pose.D)
     for one, other in ((old.left, new.left), (old.right, new.right)):
         pixels = (one.camera.project(POINTS)[0] + 0.5) / 2 - 0.5
         assert np.nanmax(np.abs(other.camera.project(POINTS)[0] - pixels)) < 1e-9
     (tmp_path / "matches.csv").write_text("uL,vL,uR,vR\n150,100,155,102\n")
-    assert run("triangulate", out, tmp_path / "matches.csv").exit_code == 0
+    succeed("triangulate", out, tmp_path / "matches.csv")
 
 
 def test_a_rig_of_three_cameras_is_resized(tmp_path: Path) -> None:
@@ -102,8 +100,7 @@ def test_a_rig_of_three_cameras_is_resized(tmp_path: Path) -> None:
         for k, t in enumerate(["", *[", T_cn_cnm1: [[1,0,0,-0.1],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"] * 2])
     ]
     (tmp_path / "chain.yaml").write_text("\n".join(lines))
-    result = run("resize", tmp_path / "chain.yaml", "--binning", 2, "-o", tmp_path / "new.yaml")
-    assert result.exit_code == 0, result.stderr
+    succeed("resize", tmp_path / "chain.yaml", "--binning", 2, "-o", tmp_path / "new.yaml")
     again = run("resize", tmp_path / "new.yaml", "--scale", 2, "--json", "-o", tmp_path / "old.yaml")
     found = json.loads(again.stdout)["cameras"]
     assert [(one["image_size"], one["alpha_u"], one["u0"]) for one in found] == [([640, 480], 400, 320)] * 3
@@ -116,8 +113,7 @@ def test_a_camera_of_another_program_is_resized(tmp_path: Path) -> None:
         "image_size": [640, 480],
     }
     (tmp_path / "camera.json").write_text(json.dumps(tree))
-    result = run("resize", tmp_path / "camera.json", "--to", 1280, 960)
-    assert result.exit_code == 0
+    result = succeed("resize", tmp_path / "camera.json", "--to", 1280, 960)
     assert "camera_matrix: {rows: 3, cols: 3, data: [1200.0, 0.0, 640.5, 0.0, 1200.0, 480.5" in result.stdout
 
 
@@ -141,7 +137,7 @@ def test_a_size_that_is_not_known_is_needed_for_another(tmp_path: Path) -> None:
     result = run("resize", tmp_path / "camera.json", "--to", 320, 240)
     assert result.exit_code == 1
     assert "the size of the images is not known; give --scale instead of --to" in result.stderr
-    assert run("resize", tmp_path / "camera.json", "--scale", 0.5).exit_code == 0
+    succeed("resize", tmp_path / "camera.json", "--scale", 0.5)
 
 
 def test_a_stretched_image_is_told(camera: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from support.command_line import run
+from support.command_line import run, succeed
 
 from neurocal_cli import read_rig
 from neurocal_cli.commands.show.text import estimates
@@ -43,13 +43,12 @@ def test_the_summary_has_all_cameras_poses_and_a_verdict(made: tuple[Path, Resul
 
 def test_names_known_cameras_and_models_of_single_cameras(tmp_path: Path) -> None:
     known = tmp_path / "known.yaml"
-    assert run("calibrate", SAMPLES[0], *FAST, "-o", known).exit_code == 0
+    succeed("calibrate", SAMPLES[0], *FAST, "-o", known)
     words = [f"{name}={path}" for name, path in zip("abc", SAMPLES, strict=True)]
-    said = run(
+    said = succeed(
         "rig", *words, "--intrinsics", f"a={known}", "--distortion", "b=k1", "--distortion-of", "c=k1k2",
         "--no-skew", "--target", "given", "--json", "-o", tmp_path / "rig.json",
     )  # fmt: skip
-    assert said.exit_code == 0, said.stderr
     found = json.loads(said.stdout)
     assert list(found["cameras"]) == ["a", "b", "c"]
     assert found["edges"][0] == {"cameras": ["a", "b"], "views": 15}
@@ -78,8 +77,7 @@ def test_wrong_words_are_refused_in_one_line(words: tuple[object, ...], said: st
 
 
 def test_the_rig_is_evaluated(made: tuple[Path, Result]) -> None:
-    own = run("evaluate", "rig", made[0])
-    assert own.exit_code == 0, own.stderr
+    own = succeed("evaluate", "rig", made[0])
     assert "rms from the other cameras' prediction [px]" in own.stdout
     assert "verdict: " in own.stdout
     new = run("evaluate", "rig", made[0], *SAMPLES, "--json")
@@ -90,8 +88,7 @@ def test_the_rig_is_evaluated(made: tuple[Path, Result]) -> None:
 
 
 def test_points_that_many_cameras_saw_are_triangulated(made: tuple[Path, Result], tmp_path: Path) -> None:
-    said = run("triangulate", made[0], ROOT / "sample_data" / "sightings.csv", "-o", tmp_path / "xyz.csv")
-    assert said.exit_code == 0, said.stderr
+    said = succeed("triangulate", made[0], ROOT / "sample_data" / "sightings.csv", "-o", tmp_path / "xyz.csv")
     assert (
         "1 of them measured without a camera that contradicts the others, mostly rig_cam1 (1)" in said.stderr
     )
@@ -132,14 +129,12 @@ def test_pixels_of_many_cameras_that_are_less_accurate_are_told_their_noise(
 def test_two_of_the_cameras_are_rectified(made: tuple[Path, Result], tmp_path: Path) -> None:
     words = "rectify", made[0], SAMPLES[0], SAMPLES[2], "-o", tmp_path / "out"
     assert "choose two by --cameras LEFT RIGHT" in run(*words).stderr
-    said = run(*words, "--cameras", "rig_cam0", "rig_cam2", "--json")
-    assert said.exit_code == 0, said.stderr
+    succeed(*words, "--cameras", "rig_cam0", "rig_cam2", "--json")
     assert (tmp_path / "out" / "left" / "rig_cam0.csv").exists()
 
 
 def test_the_cameras_and_the_boards_are_drawn(tmp_path: Path) -> None:
-    said = run("rig", *SAMPLES, *FAST, "-o", tmp_path / "rig.yaml", "--plot", tmp_path / "rig.svg")
-    assert said.exit_code == 0, said.stderr
+    succeed("rig", *SAMPLES, *FAST, "-o", tmp_path / "rig.yaml", "--plot", tmp_path / "rig.svg")
     text = (tmp_path / "rig.svg").read_text()
     assert all(f"<!-- rig_cam{k} -->" in text for k in range(3))
 
@@ -147,15 +142,14 @@ def test_the_cameras_and_the_boards_are_drawn(tmp_path: Path) -> None:
 def test_a_file_is_judged_as_what_it_is(made: tuple[Path, Result], tmp_path: Path) -> None:
     assert run("evaluate", made[0]).stdout == run("evaluate", "rig", made[0]).stdout
     camera = tmp_path / "camera.yaml"
-    assert run("calibrate", SAMPLES[0], *FAST, "-o", camera).exit_code == 0
+    succeed("calibrate", SAMPLES[0], *FAST, "-o", camera)
     assert run("evaluate", camera).stdout == run("evaluate", "camera", camera).stdout
     assert "nothing.yaml: there is no such file" in run("evaluate", "nothing.yaml").stderr
     assert f"{tmp_path}: is a folder; give a file in it" in run("evaluate", tmp_path).stderr
 
 
 def test_the_rig_has_a_page(made: tuple[Path, Result], tmp_path: Path) -> None:
-    said = run("report", made[0], "-o", tmp_path / "page.html")
-    assert said.exit_code == 0, said.stderr
+    succeed("report", made[0], "-o", tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     for words in ("Calibration of 3 cameras", "Camera rig_cam2", "common frames", "relative to rig_cam0"):
         assert words in text
@@ -177,8 +171,7 @@ def test_a_simulated_rig_has_the_errors_that_its_std_say(tmp_path: Path) -> None
         "--save",
         tmp_path / "rig",
     )
-    said = run(*words, "--json")
-    assert said.exit_code == 0, said.stderr
+    said = succeed(*words, "--json")
     found = json.loads(said.stdout)
     assert found["rmse_px"][0] == pytest.approx(0.28, abs=0.03)
     assert 0.3 < found["error_over_std"][0] < 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 
 
@@ -14,8 +14,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_folder_has_all_files_of_the_project_but_its_scripts(tmp_path: Path) -> None:
-    done = run("sample", tmp_path / "new" / "samples")
-    assert done.exit_code == 0
+    done = succeed("sample", tmp_path / "new" / "samples")
     assert done.stdout == ""
     assert contents(tmp_path / "new" / "samples") == contents(SAMPLES)
     assert len(contents(SAMPLES)) > 15
@@ -25,7 +24,7 @@ def test_a_second_time_adds_what_is_missing(tmp_path: Path) -> None:
     run("sample", tmp_path)
     (tmp_path / "flat.csv").unlink()
     before = (tmp_path / "points.csv").stat().st_mtime_ns
-    assert run("sample", tmp_path).exit_code == 0
+    succeed("sample", tmp_path)
     assert contents(tmp_path) == contents(SAMPLES)
     assert (tmp_path / "points.csv").stat().st_mtime_ns == before
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import Result
-from support.command_line import refused, run
+from support.command_line import refused, run, succeed
 from support.real_data import RealFiles
 from support.rigs import RigScene, random_rig
 from support.slow_cases import slow_but
@@ -70,8 +70,7 @@ def test_the_summary_says_what_was_found(printed: Result) -> None:
 
 
 def test_the_output_goes_on_to_evaluate(printed: Result) -> None:
-    result = run("evaluate", "stereo", "-", "--json", stdin=printed.stdout.encode())
-    assert result.exit_code == 0, result.stderr
+    result = succeed("evaluate", "stereo", "-", "--json", stdin=printed.stdout.encode())
     values = json.loads(result.stdout)
     assert values["n_points"] == 216
     assert values["rig"]["rmse"] < 2
@@ -84,26 +83,23 @@ def test_the_same_input_gives_the_same_bytes(files: tuple[Path, Path], printed: 
 @pytest.mark.slow
 def test_known_cameras_are_given_one_by_one(files: tuple[Path, Path], tmp_path: Path) -> None:
     write_calibration(calibrate(points()[0], skew=False), tmp_path / "left.yaml")
-    result = run(
+    result = succeed(
         "stereo", *files, "--no-skew", "--left-intrinsics", tmp_path / "left.yaml", "-o", tmp_path / "rig"
     )
-    assert result.exit_code == 0, result.stderr
     rig = read_stereo_rig(tmp_path / "rig")
     assert (rig.left.type, rig.right.type) == (3, 1)
     assert rig.left.std["alpha_u"] == 0
     assert "fixed" in result.stderr
-    both = run(
+    succeed(
         "stereo", *files, "--type", "3", "--left-intrinsics", tmp_path / "left.yaml",
         "--right-intrinsics", tmp_path / "left.yaml",
     )  # fmt: skip
-    assert both.exit_code == 0, both.stderr
 
 
 @pytest.mark.slow
 def test_both_cameras_are_drawn(files: tuple[Path, Path], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    result = run("stereo", *files, "--no-skew", "--plot", tmp_path / "rig.png", "-o", tmp_path / "rig.yaml")
-    assert result.exit_code == 0, result.stderr
+    succeed("stereo", *files, "--no-skew", "--plot", tmp_path / "rig.png", "-o", tmp_path / "rig.yaml")
     assert (tmp_path / "rig.png").read_bytes().startswith(b"\x89PNG")
     assert run("stereo", *files, "--plot", "rig.txt").exit_code == 2
 
@@ -191,13 +187,11 @@ def test_the_corner_rig_from_its_photographs(
     for side in ("left", "right"):
         (image,) = real_files(f"ortho3/{side}_calib.jpg")
         words = ["--board", tmp_path / "board.yaml", "--points", kind, "-o", tmp_path / f"{side}.csv"]
-        found = run("detect", image, *words)
-        assert found.exit_code == 0, found.stderr
-        camera = run(
+        succeed("detect", image, *words)
+        succeed(
             "calibrate", tmp_path / f"{side}.csv", "--distortion", "none", "--outliers", "keep",
             "-o", tmp_path / f"{side}.yaml",
         )  # fmt: skip
-        assert camera.exit_code == 0, camera.stderr
     values = json.loads(
         run("evaluate", "stereo", tmp_path / "left.yaml", tmp_path / "right.yaml", "--json").stdout
     )
@@ -216,10 +210,9 @@ def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(
     for side in ("left", "right"):
         images = real_files(f"opencv_stereo/{side}??.jpg")
         words = ["--cols", "9", "--rows", "6", "--square", "25", "-o", tmp_path / f"{side}.csv"]
-        assert run("detect", *images, *words).exit_code == 0
+        succeed("detect", *images, *words)
     words = ["--no-skew", "--distortion", "plumb_bob", "--outliers", "keep", "-o", tmp_path / "rig.yaml"]
-    result = run("stereo", tmp_path / "left.csv", tmp_path / "right.csv", *words)
-    assert result.exit_code == 0, result.stderr
+    succeed("stereo", tmp_path / "left.csv", tmp_path / "right.csv", *words)
     rig = read_stereo_rig(tmp_path / "rig.yaml")
     assert len(rig.pairs) == 13
     assert rig.rmse_px < 0.18  # OpenCV's stereoCalibrate: 0.215 px

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.made_calibration import made_points
 from support.places import SAMPLES
 from support.rigs import random_rig, sides
@@ -30,10 +30,9 @@ def rig_file(tmp_path: Path) -> Path:
     left, right = sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1)
     write_points(left, tmp_path / "l.csv")
     write_points(right, tmp_path / "r.csv")
-    result = run(
+    result = succeed(
         "stereo", tmp_path / "l.csv", tmp_path / "r.csv", "--no-skew", "--json", "-o", tmp_path / "rig.yaml"
     )
-    assert result.exit_code == 0, result.stderr
     rig, told = read_stereo_rig(tmp_path / "rig.yaml"), json.loads(result.stdout)
     assert told["t"] == rig.t.tolist()
     assert told["left"]["parameters"]["alpha_u"]["value"] == rig.left.intrinsics.alpha_u
@@ -76,8 +75,7 @@ def test_verbose_tells_the_stages_with_times(points: Path) -> None:
 
 
 def test_calibrate_sums_up_as_json(points: Path, tmp_path: Path) -> None:
-    result = run("calibrate", points, "--no-skew", "--json", "-o", tmp_path / "camera.yaml")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("calibrate", points, "--no-skew", "--json", "-o", tmp_path / "camera.yaml")
     told, found = json.loads(result.stdout), read_calibration(tmp_path / "camera.yaml")
     assert "reprojection error" not in result.stderr
     assert told["parameters"]["u0"] == {
@@ -119,8 +117,7 @@ def test_what_follows_a_rig_sums_up_as_json(rig_file: Path, tmp_path: Path) -> N
 
 
 def summary(*words: Any) -> dict[str, Any]:
-    result = run(*words, "--json")
-    assert result.exit_code == 0, result.stderr
+    result = succeed(*words, "--json")
     told = json.loads(result.stdout)
     assert isinstance(told, dict)
     return told

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from support.command_line import refused, run
+from support.command_line import refused, run, succeed
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
@@ -96,8 +96,7 @@ def test_two_calibrations_make_the_rig_themselves(folder: Path) -> None:
 
 def test_streams_go_through(folder: Path, tmp_path: Path) -> None:
     data = (folder / "matches.csv").read_bytes()
-    result = run("triangulate", folder / "rig.yaml", "-", "-o", tmp_path / "xyz.csv", stdin=data)
-    assert result.exit_code == 0
+    result = succeed("triangulate", folder / "rig.yaml", "-", "-o", tmp_path / "xyz.csv", stdin=data)
     assert result.stdout == ""
     assert result.stderr == "216 points\n"
     assert (tmp_path / "xyz.csv").read_text() == run(
@@ -141,8 +140,7 @@ def test_wrong_matches_are_flagged_and_kept(folder: Path, tmp_path: Path) -> Non
 def test_mostly_wrong_matches_are_warned_of(folder: Path, tmp_path: Path) -> None:
     rows = pixels(folder)[:, [2, 3, 0, 1]]
     write_matches(tmp_path / "m.csv", rows)
-    result = run("triangulate", folder / "rig.yaml", tmp_path / "m.csv")
-    assert result.exit_code == 0
+    result = succeed("triangulate", folder / "rig.yaml", tmp_path / "m.csv")
     assert (
         "most points are flagged off or behind; the left and the right pixels are exchanged" in result.stderr
     )

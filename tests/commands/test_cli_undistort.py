@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 
 from neurocal_cli import Correspondences, read_calibration, read_points, undistort_image, undistort_points
@@ -275,10 +275,9 @@ def test_columns_that_are_not_known_are_noted(camera: Path, tmp_path: Path) -> N
 
 def test_a_calibration_takes_its_own_lens_off(tmp_path: Path) -> None:
     calibrated = tmp_path / "camera.yaml"
-    assert run("calibrate", SAMPLES / "flat.csv", "--distortion", "k1k2", "-o", calibrated).exit_code == 0
+    succeed("calibrate", SAMPLES / "flat.csv", "--distortion", "k1k2", "-o", calibrated)
     assert undistort(calibrated, SAMPLES / "flat.csv", "-o", tmp_path / "p.csv").exit_code == 0
-    again = run("calibrate", tmp_path / "p.csv", "--distortion", "none", "-o", tmp_path / "again.yaml")
-    assert again.exit_code == 0
+    succeed("calibrate", tmp_path / "p.csv", "--distortion", "none", "-o", tmp_path / "again.yaml")
     first, second = read_calibration(calibrated), read_calibration(tmp_path / "again.yaml")
     assert pytest.approx(first.K, rel=2e-5, abs=0.02) == second.K
     assert second.rmse_px == pytest.approx(first.rmse_px, rel=1e-2)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
@@ -203,8 +203,7 @@ def test_an_image_of_another_size_is_explained(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "upright.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
     cv2.imwrite(str(tmp_path / "twice.png"), cv2.resize(image, (800, 600)))
     others = [SAMPLES / f"board0{k}.png" for k in range(1, 4)]
-    result = run("detect", tmp_path, *others, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
-    assert result.exit_code == 0
+    result = succeed("detect", tmp_path, *others, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
     for name, why in {
         "larger": "cut or scaled by a program",
         "upright": "held or turned upright",
@@ -218,5 +217,5 @@ def test_every_command_computes_in_one_thread(tmp_path: Path, monkeypatch: pytes
     for name in ("OMP_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
         monkeypatch.setenv(name, "2")
     monkeypatch.delenv("VECLIB_MAXIMUM_THREADS")
-    assert run("sample", tmp_path / "sample_data").exit_code == 0
+    succeed("sample", tmp_path / "sample_data")
     assert (os.environ["VECLIB_MAXIMUM_THREADS"], os.environ["OMP_NUM_THREADS"]) == ("1", "2")

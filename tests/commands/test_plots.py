@@ -16,7 +16,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from support.command_line import run
+from support.command_line import run, succeed
 from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
 from support.slow_cases import slow_but
@@ -151,8 +151,7 @@ def test_the_commands_draw_a_page_and_single_panels(tmp_path: Path) -> None:
     write_points(cal.points, tmp_path / "points.csv")
     write_calibration(cal, tmp_path / "camera.yaml")
     words = ["evaluate", "camera", tmp_path / "camera.yaml"]
-    result = run(*words, "--plot", tmp_path / "page.png", "--plot", f"views={tmp_path / 'views.pdf'}")
-    assert result.exit_code == 0, result.stderr
+    result = succeed(*words, "--plot", tmp_path / "page.png", "--plot", f"views={tmp_path / 'views.pdf'}")
     assert (tmp_path / "page.png").read_bytes().startswith(BEGINNINGS["png"])
     assert (tmp_path / "views.pdf").read_bytes().startswith(BEGINNINGS["pdf"])
     assert len((tmp_path / "page.png").read_bytes()) > 3 * len((tmp_path / "views.pdf").read_bytes())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
@@ -85,8 +85,7 @@ def test_an_output_without_an_input_is_refused(tmp_path: Path, monkeypatch: pyte
 
 def test_a_board_for_points_that_have_their_places_is_said_not_to_be_used() -> None:
     board = ("--cols", 9, "--rows", 6, "--square", 30)
-    result = run("convert", FLAT, "--to", "neurocal", *board)
-    assert result.exit_code == 0
+    result = succeed("convert", FLAT, "--to", "neurocal", *board)
     assert f"note: {FLAT}: has the places of its points, so the board is not used\n" in result.stderr
     result = run("convert", FLAT, "--to", "neurocal", "--unit", "m")
     assert (result.exit_code, result.stdout) == (1, "")

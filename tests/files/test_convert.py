@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.command_line import run
+from support.command_line import run, succeed
 from support.distorted import LENSES
 from support.made_calibration import made_calibration
 
@@ -478,8 +478,7 @@ def test_a_file_of_neurocal_is_written_again_as_it_is(camera_file: Path) -> None
 
 
 def test_the_command_says_what_is_lost(camera_file: Path, tmp_path: Path) -> None:
-    result = run("convert", camera_file, "--to", "opencv", "-o", tmp_path / "camera.xml")
-    assert result.exit_code == 0
+    result = succeed("convert", camera_file, "--to", "opencv", "-o", tmp_path / "camera.xml")
     assert "note: a file of OpenCV has no place for standard deviations" in result.stderr
     assert "warning: camera: programs of OpenCV ignore skew" in result.stderr
     assert (tmp_path / "camera.xml").read_text().startswith("<?xml")
@@ -495,9 +494,9 @@ def test_poses_that_a_format_lacks_are_named(target: str, camera_file: Path, tmp
 
 def test_a_camera_that_was_converted_serves_as_a_calibration(camera_file: Path, tmp_path: Path) -> None:
     for words in (["--to", "npz", "-o", tmp_path / "a.npz"], ["--to", "matlab", "-o", tmp_path / "a.mat"]):
-        assert run("convert", camera_file, *words).exit_code == 0
+        succeed("convert", camera_file, *words)
         place = words[-1]
-        assert run("convert", place, "--to", "neurocal", "-o", tmp_path / "b.yaml").exit_code == 0
+        succeed("convert", place, "--to", "neurocal", "-o", tmp_path / "b.yaml")
         found = read_calibration(tmp_path / "b.yaml")
         assert np.abs(found.K - made_calibration(1).K).max() < 1e-9
         assert list(found.views) == ["view00", "view01", "view02"]
@@ -512,8 +511,7 @@ def test_a_rig_that_was_converted_serves_as_a_rig(tmp_path: Path) -> None:
     assert isinstance(rig, StereoRig)
     assert rig.unit == "m"
     (tmp_path / "matches.csv").write_text("uL,vL,uR,vR\n400,250,340,255\n")
-    result = run("triangulate", tmp_path / "rig.yaml", tmp_path / "matches.csv")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("triangulate", tmp_path / "rig.yaml", tmp_path / "matches.csv")
     assert "nan" not in result.stdout
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.command_line import run
+from support.command_line import run, succeed
 from support.real_data import RealFiles
 
 from neurocal_cli import Board, Correspondences, calibrate, read_points, read_rig_points, write_points
@@ -73,8 +73,7 @@ def test_points_come_back_from_each_format(target: str, ending: str, gap: bool, 
         return
     assert result.exit_code == 0, result.stderr
     words = SIZE if target == "mrcal" else []
-    result = run("convert", place, *words, "--to", "neurocal", "-o", tmp_path / "again.csv")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("convert", place, *words, "--to", "neurocal", "-o", tmp_path / "again.csv")
     found = read_points(tmp_path / "again.csv")
     if target == "matlab":  # it has no ids of points
         assert np.abs(found.pixels - given.pixels).max() < 1e-9
@@ -164,8 +163,7 @@ def test_files_of_places_and_pixels_apart(tmp_path: Path) -> None:
         np.savetxt(tmp_path / f"im{k}.txt", view, delimiter=",")
     names = [tmp_path / name for name in ("world.txt", "im0.txt", "im1.txt", "im2.txt")]
     for words in (names, [*names[1:], *SIZE]):
-        result = run("convert", *words, "--to", "neurocal", "--unit", "cm", "-o", tmp_path / "p.csv")
-        assert result.exit_code == 0, result.stderr
+        succeed("convert", *words, "--to", "neurocal", "--unit", "cm", "-o", tmp_path / "p.csv")
         found = read_points(tmp_path / "p.csv")
         assert found.view_names == ("im0", "im1", "im2")
         assert found.unit == "cm"
@@ -238,11 +236,10 @@ def test_points_come_through_pipes(target: str, ending: str, tmp_path: Path) -> 
     """As in ``neurocal detect ... | neurocal convert - --to mrcal``, and back."""
     write_points(points(pixels()), tmp_path / "points.csv")
     by_name = tmp_path / f"corners{ending}"
-    assert run("convert", tmp_path / "points.csv", "--to", target, "-o", by_name).exit_code == 0
+    succeed("convert", tmp_path / "points.csv", "--to", target, "-o", by_name)
     piped = tmp_path / f"piped{ending}"
     csv = (tmp_path / "points.csv").read_bytes()
-    result = run("convert", "-", "--to", target, "-o", piped, stdin=csv)
-    assert result.exit_code == 0, result.stderr
+    result = succeed("convert", "-", "--to", target, "-o", piped, stdin=csv)
     assert "60 points of 3 views" in result.stderr
     if target != "matlab":  # it stores the time
         assert piped.read_bytes() == by_name.read_bytes()
@@ -297,8 +294,7 @@ def test_mid_points_are_not_passed_on_silently(tmp_path: Path) -> None:
         np.eye(4, 3), np.arange(8.0).reshape(4, 2), point=ids, across=np.tile([1.0, 0.0], (4, 1))
     )
     write_points(given, tmp_path / "points.csv")
-    result = run("convert", tmp_path / "points.csv", "--to", "json", "-o", tmp_path / "a.json")
-    assert result.exit_code == 0
+    result = succeed("convert", tmp_path / "points.csv", "--to", "json", "-o", tmp_path / "a.json")
     assert "mid-points are measured in one direction only" in result.stderr
     assert len(json.loads((tmp_path / "a.json").read_text())["image_points"][0]) == 4
     result = run("convert", tmp_path / "points.csv", "--to", "mrcal")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 
 from neurocal_cli import Intrinsics, Pose, calibrate, calibrate_rig, read_points
 from neurocal_cli.camera.camera import Camera
@@ -21,8 +21,7 @@ WORLD = np.random.default_rng(0).uniform(-50, 150, (20, 3))
 
 
 def written(source: Path, *words: str) -> Array:
-    done = run("convert", str(source), "--to", "dlt", *words, "-o", str(source.with_suffix(".csv")))
-    assert done.exit_code == 0, done.stderr
+    succeed("convert", str(source), "--to", "dlt", *words, "-o", str(source.with_suffix(".csv")))
     return np.loadtxt(source.with_suffix(".csv"), delimiter=",", ndmin=2)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.real_data import FOLDER, RealFiles
 
@@ -303,8 +303,7 @@ def test_the_points_of_a_file_are_read(name: str, real_files: RealFiles, tmp_pat
     count, views, first = POINTS[name]
     words = ["--what", "points", "--to", "neurocal", "-o", tmp_path / "points.csv"]
     unit = ["--unit", "m"] if name not in ("units.csv", *BOARDS) else []
-    result = run("convert", path, *words, *BOARDS.get(name, []), *unit)
-    assert result.exit_code == 0, result.stderr
+    succeed("convert", path, *words, *BOARDS.get(name, []), *unit)
     found = read_points(tmp_path / "points.csv")
     assert (len(found), found.n_views) == (count, views)
     assert found.unit == ("m" if unit else "mm")
@@ -348,7 +347,7 @@ def test_a_file_of_a_camera_and_points_gives_either(real_files: RealFiles) -> No
 def test_a_ros_file_keeps_its_rectification(real_files: RealFiles, tmp_path: Path) -> None:
     (path,) = real_files("other_programs/usb_cam.yaml")
     assert read_cameras([path]).poses == {}
-    assert run("convert", path, "--to", "ros", "-o", tmp_path / "again.yaml").exit_code == 0
+    succeed("convert", path, "--to", "ros", "-o", tmp_path / "again.yaml")
     import yaml
 
     before, after = (yaml.safe_load(place.read_text()) for place in (path, tmp_path / "again.yaml"))
@@ -381,8 +380,7 @@ def test_the_corners_of_caliscope_are_points(real_files: RealFiles, tmp_path: Pa
     lines = path.read_text().splitlines()
     one = [lines[0], *(line for line in lines[1:] if line.split(",")[1] == "2")]
     (tmp_path / "two.csv").write_text("\n".join(one))
-    result = run("convert", tmp_path / "two.csv", "--to", "neurocal", "-o", tmp_path / "points.csv")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("convert", tmp_path / "two.csv", "--to", "neurocal", "-o", tmp_path / "points.csv")
     found = read_points(tmp_path / "points.csv")
     assert (len(found), found.unit, found.world[:, 2].any()) == (len(one) - 1, "m", False)
     row = one[1].split(",")

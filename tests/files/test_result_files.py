@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from support.command_line import run
+from support.command_line import run, succeed
 from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
 from support.verdicts import verdict_on
@@ -182,12 +182,11 @@ def test_many_numbers_of_many_digits_are_packed(tmp_path: Path) -> None:
 def test_the_commands_write_what_the_name_says(tmp_path: Path) -> None:
     write_points(made_calibration(3).points, tmp_path / "points.csv")
     words = ["calibrate", tmp_path / "points.csv", "--distortion", "none"]
-    result = run(*words, "--lean", "-o", tmp_path / "camera.json")
-    assert result.exit_code == 0, result.stderr
+    result = succeed(*words, "--lean", "-o", tmp_path / "camera.json")
     tree = json.loads((tmp_path / "camera.json").read_text())
     assert tree["neurocal"]["views"] == []
     assert tree["neurocal"]["verdict"]["word"] in ("good", "usable", "poor")
-    assert run("evaluate", "camera", tmp_path / "camera.json", tmp_path / "points.csv").exit_code == 0
+    succeed("evaluate", "camera", tmp_path / "camera.json", tmp_path / "points.csv")
     result = run("evaluate", "camera", tmp_path / "camera.json")
     assert result.exit_code == 1
     assert "Error: " in result.stderr

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.scenes import random_flat_set, table_1
@@ -77,8 +77,7 @@ def test_a_method_without_an_answer_says_why() -> None:
 
 def test_compare_shows_two_cameras_as_table_2_does() -> None:
     sides = [SAMPLES / f"stereo_{side}.csv" for side in ("left", "right")]
-    shown = run("compare", *sides, "--no-skew", "--distortion", "none", "--methods", "neuro,opencv")
-    assert shown.exit_code == 0, shown.stderr
+    shown = succeed("compare", *sides, "--no-skew", "--distortion", "none", "--methods", "neuro,opencv")
     assert "both cameras, each calibrated alone" in shown.stdout
     done = run("compare", *sides, "--no-skew", "--distortion", "none", "--methods", "neuro,opencv", "--json")
     found = json.loads(done.stdout)
@@ -130,8 +129,7 @@ def test_simulate_takes_several_sigmas_and_gives_the_same_bytes_again(tmp_path: 
         "2",
         "--json",
     ]
-    one = run(*words, "--jobs", "1", "--plot", tmp_path / "fig1.png")
-    assert one.exit_code == 0, one.stderr
+    one = succeed(*words, "--jobs", "1", "--plot", tmp_path / "fig1.png")
     found = json.loads(one.stdout)
     assert found["sigma"] == [0.5, 1.0]
     assert set(found["methods"]) == {"neuro", "nonlinear", "linear", "tsai"}
@@ -144,7 +142,7 @@ def test_simulate_takes_several_sigmas_and_gives_the_same_bytes_again(tmp_path: 
 
 def test_levels_of_noise_that_are_nearly_alike_are_saved_apart(tmp_path: Path) -> None:
     words = ("--trials", 1, "--random-starts", 0, "--methods", "linear", "--sigma", 1, 0.1, 0.1000001)
-    assert run("simulate", *words, "--save", tmp_path).exit_code == 0
+    succeed("simulate", *words, "--save", tmp_path)
     assert {path.name for path in tmp_path.glob("sigma*")} == {
         "sigma_1.csv", "sigma_0.1.csv", "sigma_0.1000001.csv"
     }  # fmt: skip
@@ -153,16 +151,14 @@ def test_levels_of_noise_that_are_nearly_alike_are_saved_apart(tmp_path: Path) -
 def test_what_simulate_saves_can_be_calibrated_and_detected(tmp_path: Path) -> None:
     folder = tmp_path / "made"
     words = ["--trials", "1", "--sigma", "0.2", "--random-starts", "0", "--jobs", "1", "--methods", "linear"]
-    done = run("simulate", *words, "--save", folder, "--images")
-    assert done.exit_code == 0, done.stderr
+    succeed("simulate", *words, "--save", folder, "--images")
     names = {path.name for path in folder.iterdir()}
     assert names == {"truth.yaml", "exact.csv", "visible.csv", "sigma_0.2.csv", "board.yaml", "view.png"}
     exact = calibrate(read_points(folder / "exact.csv"), outliers="keep", distortion="none")
     assert exact.intrinsics.alpha_u == pytest.approx(556.0, rel=1e-9)
     judged = run("evaluate", "camera", folder / "truth.yaml", folder / "sigma_0.2.csv", "--json")
     assert json.loads(judged.stdout)["rmse_px"] == pytest.approx(0.2 * np.sqrt(2), rel=0.1)
-    found = run("detect", folder / "view.png", "--board", folder / "board.yaml", "-o", tmp_path / "found.csv")
-    assert found.exit_code == 0, found.stderr
+    succeed("detect", folder / "view.png", "--board", folder / "board.yaml", "-o", tmp_path / "found.csv")
     again = run("simulate", *words, "--camera", folder / "truth.yaml", "--json")
     assert json.loads(again.stdout)["truth"]["alpha_u"] == pytest.approx(556.0)
 
@@ -181,8 +177,7 @@ def test_the_simulated_board_may_be_described_in_short() -> None:
         "linear",
         "--json",
     )
-    done = run("simulate", "--board", "chessboard:5x4:30", *words)
-    assert done.exit_code == 0, done.stderr
+    done = succeed("simulate", "--board", "chessboard:5x4:30", *words)
     assert json.loads(done.stdout)["n_points"] == 2 * (4 * 4 + 5 * 3)
 
 
@@ -195,7 +190,7 @@ def test_table_2_on_a_corner_of_three_boards(real_files: RealFiles, tmp_path: Pa
     for side in ("left", "right"):
         (image,) = real_files(f"ortho3/{side}.jpg")
         sides.append(tmp_path / f"{side}.csv")
-        assert run("detect", image, "--board", board, "-o", sides[-1]).exit_code == 0
+        succeed("detect", image, "--board", board, "-o", sides[-1])
     found = json.loads(run("compare", *sides, "--distortion", "none", "--json").stdout)
     stereo = found["stereo"]
     assert set(stereo) == {"neuro", "nonlinear", "linear", "tsai", "opencv"}
@@ -212,7 +207,7 @@ def test_table_2_on_thirteen_pairs_of_a_flat_board(real_files: RealFiles, tmp_pa
         images = real_files(f"opencv_stereo/{side}??.jpg")
         sides.append(tmp_path / f"{side}.csv")
         words = ["--cols", "9", "--rows", "6", "--square", "25", "-o", sides[-1]]
-        assert run("detect", *images, *words).exit_code == 0
+        succeed("detect", *images, *words)
     found = json.loads(run("compare", *sides, "--json").stdout)
     stereo = found["stereo"]
     assert stereo["neuro"]["rmse"] < 0.25
@@ -224,9 +219,8 @@ def test_table_2_on_thirteen_pairs_of_a_flat_board(real_files: RealFiles, tmp_pa
 def test_points_of_one_camera_are_compared_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "points.csv"
     write_points(noisy(), path)
-    done = run(
+    done = succeed(
         "compare", path, "--distortion", "none", "--methods", "linear,nonlinear", "--image-size", 640, 480
     )
-    assert done.exit_code == 0, done.stderr
     assert "both cameras" not in done.stdout
     assert "lowest held-out error: nonlinear" in done.stdout

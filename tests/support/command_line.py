@@ -20,6 +20,13 @@ def run(*words: object, stdin: bytes | None = None, env: dict[str, str] | None =
     return runner.invoke(neurocal, [str(word) for word in words], input=stdin, env=env, prog_name="neurocal")
 
 
+def succeed(*words: object, stdin: bytes | None = None, env: dict[str, str] | None = None) -> Result:
+    """Run ``neurocal WORDS``, which must not fail."""
+    result = run(*words, stdin=stdin, env=env)
+    assert result.exit_code == 0, result.stderr
+    return result
+
+
 def refused(result: Result, *parts: str) -> None:
     """Check that a command failed with nothing on stdout, and an error of one line that has these parts."""
     assert (result.exit_code, result.stdout) == (1, "")

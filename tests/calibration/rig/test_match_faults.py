@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import succeed
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import Pose, StereoRig, write_rig
@@ -100,6 +100,5 @@ def test_the_command_names_it(tmp_path: Path) -> None:
     left, right = matches()
     rows = "\n".join(",".join(map(repr, row)) for row in np.hstack([right, left]).tolist())
     (tmp_path / "matches.csv").write_text(f"uL,vL,uR,vR\n{rows}\n")
-    result = run("triangulate", tmp_path / "rig.yaml", tmp_path / "matches.csv")
-    assert result.exit_code == 0
+    result = succeed("triangulate", tmp_path / "rig.yaml", tmp_path / "matches.csv")
     assert "the left and the right pixels are exchanged; give uL,vL of the left camera" in result.stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.rigs import random_rig, sides
@@ -43,8 +43,7 @@ def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bumped")
     points = in_parts(scene(), turned(scene(), 0.3), 6)
     paths = [csv(side, folder / f"{name}.csv") for side, name in zip(points, ("l", "r"), strict=True)]
-    result = run("stereo", *paths, "--no-skew", "--distortion", "none", "-o", folder / "rig.yaml")
-    assert result.exit_code == 0, result.stderr
+    result = succeed("stereo", *paths, "--no-skew", "--distortion", "none", "-o", folder / "rig.yaml")
     assert "verdict: poor" in result.stderr
     assert re.search(r"^distortion model +none +none$", result.stderr, re.MULTILINE)
     assert "moved between left06/right06 and left07/right07" in result.stderr
@@ -74,8 +73,7 @@ def test_evaluate_tells_the_verdict(bumped: Path) -> None:
 
 
 def test_triangulate_warns_of_a_poor_rig(bumped: Path) -> None:
-    result = run("triangulate", bumped / "rig.yaml", "-", stdin=b"uL,vL,uR,vR\n300,200,250,200\n")
-    assert result.exit_code == 0
+    result = succeed("triangulate", bumped / "rig.yaml", "-", stdin=b"uL,vL,uR,vR\n300,200,250,200\n")
     assert "warning: the rig is poor: the rig moved between" in result.stderr
 
 
@@ -156,7 +154,7 @@ def test_a_real_rig_is_not_blamed(real_files: RealFiles, tmp_path: Path, layout:
     for side in ("left", "right"):
         images = real_files(f"opencv_stereo/{side}??.jpg")
         words = ["--cols", "9", "--rows", "6", "--square", "25", "--points", layout]
-        assert run("detect", *images, *words, "-o", tmp_path / f"{side}.csv").exit_code == 0
+        succeed("detect", *images, *words, "-o", tmp_path / f"{side}.csv")
     rig = calibrate_stereo(*(read_points(tmp_path / f"{side}.csv") for side in ("left", "right")))
     assert verdict_on(rig).word in ("good", "usable")
     assert all(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import run, succeed
 from support.noisy_flat_set import pose, trial
 from support.places import SAMPLES
 
@@ -156,8 +156,7 @@ def test_a_given_place_is_exact_and_one_without_points_unknown() -> None:
 def test_the_commands_show_both(tmp_path: Path) -> None:
     for name, rig in (("rig.yaml", three()), ("pair.yaml", pair())):
         write_rig(rig, tmp_path / name)
-        shown = run("evaluate", tmp_path / name, "--at", "1m")
-        assert shown.exit_code == 0
+        shown = succeed("evaluate", tmp_path / name, "--at", "1m")
         assert "at 1000 mm" in shown.stdout
         assert "its depth" in shown.stdout
         tree = json.loads(run("evaluate", tmp_path / name, "--at", "100cm", "--json").stdout)["at"]
