@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import refused, run
 from support.rigs import RigScene, random_rig, sides
 from support.slow_cases import slow_but
 from support.verdicts import verdict_on
@@ -227,8 +227,7 @@ def test_a_covariance_that_was_edited_is_refused(
     (tmp_path / "edited.json").write_text(json.dumps(tree))
     write_points(flat(), tmp_path / "points.csv")
     result = run("calibrate", tmp_path / "points.csv", "--type", 3, "--intrinsics", tmp_path / "edited.json")
-    assert result.exit_code == 1
-    assert message in result.stderr
+    refused(result, message)
 
 
 def test_what_is_taken_as_exact_is_said(tmp_path: Path) -> None:

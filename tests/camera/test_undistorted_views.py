@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.command_line import run, succeed
+from support.command_line import refused, run, succeed
 from support.slow_cases import slow_but
 from support.wide_cameras import SIZE, WIDE_LENSES, wide_camera, wide_points
 
@@ -215,9 +215,8 @@ def test_the_command_says_what_is_lost(camera: Path, tmp_path: Path) -> None:
     rays = panorama.unproject(np.column_stack([np.arange(100, 600, 50), np.full(10, 250)]))
     assert wide_camera("double_sphere").project(rays)[0] == pytest.approx(pixels, abs=1e-3)
     assert "projection: equirectangular" in new.read_text()
-    refused = run("undistort", new, tmp_path / "a.png", "-o", tmp_path / "b.png")
-    assert refused.exit_code == 1
-    assert "is the file of an undistorted panorama" in refused.stderr
+    result = run("undistort", new, tmp_path / "a.png", "-o", tmp_path / "b.png")
+    refused(result, "is the file of an undistorted panorama")
 
 
 def test_tables_need_no_image(camera: Path, tmp_path: Path) -> None:

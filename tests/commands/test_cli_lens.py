@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 from simulated_zoom import write_lens_points
-from support.command_line import run, succeed
+from support.command_line import refused, run, succeed
 from support.zoom_laws import FLOOR, between, grid, seen
 
 from neurocal_cli.calibration.zoom.fit import fit_lens
@@ -216,8 +216,7 @@ def test_lists_of_cameras_that_cannot_be_used_are_refused(tmp_path: Path, lines:
     (tmp_path / "fisheye.yml").write_text(fisheye + "distortion_model: equidistant\n")
     (tmp_path / "list.csv").write_text(lines)
     result = run("lens", "fit", tmp_path / "list.csv", "-o", tmp_path / "lens.yaml")
-    assert result.exit_code == 1
-    assert message in result.stderr
+    refused(result, message)
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "lens.yaml").exists()
 
@@ -266,8 +265,7 @@ def test_one_view_name_at_several_settings_is_told_apart(folder: Path) -> None:
 def test_bad_input_is_one_clear_line(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "bad.csv").write_text(content)
     result = run("lens", "fit", tmp_path / "bad.csv", "-o", tmp_path / "lens.yaml")
-    assert result.exit_code == 1
-    assert message in result.stderr
+    refused(result, message)
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "lens.yaml").exists()
 
@@ -315,8 +313,7 @@ def test_a_lens_file_that_was_changed_is_refused_with_the_key(folder: Path, old:
 
 def test_calibrate_points_to_lens_fit(folder: Path) -> None:
     result = run("calibrate", folder / "points.csv")
-    assert result.exit_code == 1
-    assert "neurocal lens fit" in result.stderr
+    refused(result, "neurocal lens fit")
 
 
 def test_the_program_gives_the_same_bytes_again(folder: Path, known: Result) -> None:

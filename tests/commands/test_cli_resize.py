@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import run, succeed
+from support.command_line import refused, run, succeed
 from support.made_calibration import made_calibration
 from support.places import SAMPLES
 from support.rigs import random_rig
@@ -135,8 +135,7 @@ def test_a_wrong_request_is_refused(words: list[object], code: int, message: str
 def test_a_size_that_is_not_known_is_needed_for_another(tmp_path: Path) -> None:
     (tmp_path / "camera.json").write_text('{"K": [[600, 0, 320], [0, 600, 240], [0, 0, 1]]}')
     result = run("resize", tmp_path / "camera.json", "--to", 320, 240)
-    assert result.exit_code == 1
-    assert "the size of the images is not known; give --scale instead of --to" in result.stderr
+    refused(result, "the size of the images is not known; give --scale instead of --to")
     succeed("resize", tmp_path / "camera.json", "--scale", 0.5)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.command_line import run, succeed
+from support.command_line import refused, run, succeed
 from support.places import SAMPLES
 
 
@@ -32,8 +32,7 @@ def test_a_second_time_adds_what_is_missing(tmp_path: Path) -> None:
 def test_a_file_of_the_user_is_kept(tmp_path: Path) -> None:
     (tmp_path / "zoom.csv").write_text("mine\n")
     done = run("sample", tmp_path)
-    assert done.exit_code == 1
-    assert "zoom.csv: is no file of the sample data; give another folder" in done.stderr
+    refused(done, "zoom.csv: is no file of the sample data; give another folder")
     assert contents(tmp_path) == {"zoom.csv": b"mine\n"}
 
 
@@ -46,6 +45,5 @@ def test_a_file_instead_of_the_folder_is_wrong_use(tmp_path: Path) -> None:
 def test_without_the_data_the_error_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neurocal_cli.files.sample_data._sources", lambda: iter([tmp_path]))
     done = run("sample", tmp_path / "samples")
-    assert done.exit_code == 1
-    assert "install neurocal again" in done.stderr
+    refused(done, "install neurocal again")
     assert not (tmp_path / "samples").exists()

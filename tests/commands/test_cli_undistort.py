@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from support.command_line import run, succeed
+from support.command_line import refused, run, succeed
 from support.places import SAMPLES
 
 from neurocal_cli import Correspondences, read_calibration, read_points, undistort_image, undistort_points
@@ -131,8 +131,7 @@ def test_depth_and_colours_stay(camera: Path, tmp_path: Path, dtype: type, shape
 def test_sixteen_bits_do_not_become_eight(camera: Path, tmp_path: Path) -> None:
     write(tmp_path / "in.png", np.zeros((300, 400), np.uint16))
     result = undistort(camera, tmp_path / "in.png", "-o", tmp_path / "out.jpg")
-    assert result.exit_code == 1
-    assert "an image of 16 bits cannot be written to a .jpg file; use .png" in result.stderr
+    refused(result, "an image of 16 bits cannot be written to a .jpg file; use .png")
     assert not (tmp_path / "out.jpg").exists()
 
 
@@ -260,8 +259,7 @@ def test_a_pixel_that_cannot_have_been_seen_is_named_by_its_line(points: Path, t
 def test_points_of_another_size_are_refused(camera: Path, points: Path) -> None:
     points.write_text(points.read_text().replace("400 300", "640 480"))
     result = undistort(camera, points)
-    assert result.exit_code == 1
-    assert "the image_size is 640 x 480 px, but the camera is for 400 x 300 px" in result.stderr
+    refused(result, "the image_size is 640 x 480 px, but the camera is for 400 x 300 px")
 
 
 def test_columns_that_are_not_known_are_noted(camera: Path, tmp_path: Path) -> None:

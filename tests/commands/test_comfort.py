@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command_line import run, succeed
+from support.command_line import refused, run, succeed
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
@@ -193,8 +193,7 @@ def test_what_a_phone_saves_is_named_with_how_to_convert_it(tmp_path: Path) -> N
     file.write_bytes(b"\0\0\0\x18ftypheic" + bytes(200))
     for words in ((), ("--cols", 9, "--rows", 6)):
         result = run("detect", file, "--square", 25, *words)
-        assert result.exit_code == 1
-        assert "is a HEIC file, which is not read; convert it, as with `heif-convert" in result.stderr
+        refused(result, "is a HEIC file, which is not read; convert it, as with `heif-convert")
 
 
 def test_an_image_of_another_size_is_explained(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_line import run
+from support.command_line import refused, run
 from support.made_calibration import made_calibration
 from support.places import SAMPLES
 from support.rigs import random_rig
@@ -54,8 +54,7 @@ def test_a_file_of_another_kind_is_named(
 ) -> None:
     monkeypatch.chdir(folder)
     result = run(*words)
-    assert result.exit_code == 1
-    assert message in result.stderr
+    refused(result, message)
 
 
 @pytest.mark.parametrize(
@@ -80,5 +79,4 @@ def test_a_rig_that_was_edited_in_one_place_is_refused(
     change(rig)
     (folder / "rig.json").write_text(json.dumps(rig))
     result = run("triangulate", folder / "rig.json", folder / "matches.csv")
-    assert result.exit_code == 1
-    assert message in result.stderr
+    refused(result, message)
