@@ -86,7 +86,8 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     ones = np.ones(60)
     pixels = FitPixels(nothing, nothing, nothing, nothing)
     shape = ProfileShape(np.zeros((60, 2)), np.zeros(1))
-    fit = BatchFit(values, information, prior, ones, lambda *_: linear, pixels, shape, ones, linear)
+    of_pixels = nothing, nothing, linear
+    fit = BatchFit(values, information, prior, ones, lambda *_: linear, pixels, shape, ones, *of_pixels)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
     np.testing.assert_allclose(blur.along(normal), true, rtol=0.08)
 

@@ -20,7 +20,8 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.strips import Single
 
-Part = NDArray[np.intp] | slice  # indices of some of the fits
+# Indices of some of the fits, and of some of their pixels.
+Part = NDArray[np.intp] | slice | tuple[NDArray[np.intp], NDArray[np.intp] | slice]
 Some = TypeVar("Some", bound="PerFit")
 
 # Positions of the last three values of every fit: mean level and half contrast [DN], sigma_t [px].
@@ -29,6 +30,7 @@ LEAST_BLUR = 0.2905  # px; the pixel's box alone has sqrt(1/12) = 0.2887
 # Insensitive.
 # The iteration ends when this share of the fits expects a further step below so many standard deviations.
 _MOST, _CONVERGED = 0.9, 0.05
+_TOGETHER = 1 << 16  # pixels, padding included, that are fitted at once
 _MORE_STEPS = 20  # greatest number, for fits that have not converged with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
 _FLOAT32 = 1e-6  # relative error of float32 sums
@@ -133,6 +135,9 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
     return rows
 
 
+_OF_FITS, _OF_PIXELS = ("values", "information", "chi2", "step"), ("residual", "x")  # of `BatchFit`
+
+
 @frozen_dataclass(eq=False)
 class BatchFit:
     """Result of many fits."""
@@ -145,7 +150,9 @@ class BatchFit:
     pixels: FitPixels
     shape: ProfileShape
     step: Array  # (E,) expected length of a further step, in standard deviations
-    linear: Linearised  # the model at the values, to first order in the last step
+    residual: Single  # (E, N) as in `Linearised`
+    x: Single  # (E, N) as well, before the last step
+    last: Linearised | None = None  # the model as it was evaluated last, unless fitted in parts
     bent: bool = False  # whether the light may be bent within a fit, by more than the model has
 
     @cached_property
@@ -163,6 +170,11 @@ class BatchFit:
     def count(self) -> NDArray[np.int64]:
         """(E,) number of pixels used."""
         return np.count_nonzero(self.pixels.root, axis=1)
+
+    @property
+    def linear(self) -> Linearised:
+        """The model at the values."""
+        return self.last or self.model(self.pixels, self.values, self.shape)
 
     @property
     def chi2_per_pixel(self) -> Array:
@@ -205,15 +217,12 @@ class BatchFit:
             both[which] = some
             return both
 
-        self.linear.put(which, part.linear)
-        return replace(
-            self,
-            values=joined(self.values, part.values),
-            information=joined(self.information, part.information),
-            chi2=joined(self.chi2, part.chi2),
-            step=joined(self.step, part.step),
-            pixels=replace(self.pixels, root=joined(self.pixels.root, pixels.root)),
-        )
+        names = (*_OF_FITS, *_OF_PIXELS)
+        changed: dict[str, Any] = {name: joined(getattr(self, name), getattr(part, name)) for name in names}
+        if self.last is not None and part.last is not None:
+            self.last.put(which, part.last)
+        pixels = replace(self.pixels, root=joined(self.pixels.root, pixels.root))
+        return replace(self, pixels=pixels, last=self.last if part.last is not None else None, **changed)
 
 
 def fit_batch(
@@ -227,8 +236,46 @@ def fit_batch(
 ) -> BatchFit:
     """Run all fits together from values (E, P), and then continue those that have not converged.
 
-    `steps` and `more` are the greatest numbers of steps of all, and of those that continue.
+    `steps` and `more` are the greatest numbers of steps of all, and of those that continue. Many pixels are
+    fitted in parts with like numbers of them, which need little padding and fit into the processor's cache.
     """
+    length = pixels.root.shape[1] - (pixels.root[:, ::-1] > 0).argmax(axis=1)
+    order = np.argsort(-length, kind="stable")
+    some = np.array_split(order, max(1, pixels.root.size // _TOGETHER))
+    if len(some) == 1:
+        return _fit_together(model, pixels, start, prior, shape, steps, more)
+    parts = [
+        _fit_together(
+            model,
+            pixels.part((which, slice(length[which[0]]))),
+            start[which],
+            prior.part(which),
+            shape.part(which),
+            steps,
+            more,
+        )
+        for which in some
+    ]
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts])[np.argsort(order)] for name in _OF_FITS
+    }
+    for name in _OF_PIXELS:
+        joined[name] = np.zeros_like(pixels.root)
+        for which, part in zip(some, parts, strict=True):
+            joined[name][which, : part.x.shape[1]] = getattr(part, name)
+    return BatchFit(prior=prior, model=model, pixels=pixels, shape=shape, **joined)
+
+
+def _fit_together(
+    model: Callable[[Pixels, Array, ProfileShape], Linearised],
+    pixels: Pixels,
+    start: Array,
+    prior: LevelPrior,
+    shape: ProfileShape,
+    steps: int,
+    more: int,
+) -> BatchFit:
+    """Run fits as in `fit_batch`, all at once."""
 
     def model_of(part: Part) -> Callable[[Array], Linearised]:
         some, own = pixels.part(part), shape.part(part)
@@ -244,7 +291,8 @@ def fit_batch(
         part.iterate(model_of(unconverged), prior.part(unconverged), more, 1.0)
         state.put(unconverged, part)
     information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
-    return BatchFit(state.values, information, prior, chi2, model, pixels, shape, state.size, state.linear)
+    of_pixels = state.linear.residual, state.linear.x, state.linear
+    return BatchFit(state.values, information, prior, chi2, model, pixels, shape, state.size, *of_pixels)
 
 
 @dataclass(eq=False)

@@ -92,9 +92,9 @@ class PixelNoise:
     @classmethod
     def of(cls, fit: BatchFit, floor: float) -> PixelNoise:
         """Estimate the noise from the residuals of fits; `floor` [DN^2], that of rounding, is the least."""
-        x, root = fit.linear.x, fit.pixels.root
+        x, root = fit.x, fit.pixels.root
         used = root > 0
-        square = np.square(fit.linear.residual / np.maximum(root, _TINY))
+        square = np.square(fit.residual / np.maximum(root, _TINY))
         variances = []
         for part in (x < -_FLAT, np.abs(x) <= _FLAT, x > _FLAT):
             mine = part & used
@@ -126,27 +126,24 @@ def reshaped(fit: BatchFit, good: NDArray[np.bool_]) -> BatchFit:
     # A part of the pixels is enough for a dozen unknowns.
     data, shape = fit.pixels, fit.shape
     step = max(1, int(fit.count[good].sum()) // _ENOUGH)
-    edges, (_, width, length) = np.flatnonzero(good)[:, None], fit.linear.rows.shape
+    edges, length = np.flatnonzero(good)[:, None], data.root.shape[1]
     # Each edge starts at another pixel; otherwise all samples would lie at the same distances from the edges.
-    some = np.arange(0, length - step + 1, step) + 7 * edges % step
-    place, first = edges * length + some, edges * (width * length) + some
-    z, x, Q, root, scale = (
-        y.reshape(-1).take(place) for y in (fit.linear.z, fit.linear.x, data.Q, data.root, data.gain)
-    )
-    _, density = erf_and_density(z)
-    scale *= root
+    some = data.part((edges, np.arange(0, length - step + 1, step) + 7 * edges % step))
+    linear = fit.model(some, fit.values[good], shape.part(edges[:, 0]))
+    x, scale = linear.x, some.gain * some.root
     scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
-    steep = scale * Q if not shape.nonlinearity.any() else response(x, shape.nonlinearity)[1] * Q * scale
+    steep = some.Q * scale
+    if shape.nonlinearity.any():
+        steep *= response(x, shape.nonlinearity)[1]
     # One product per edge is too small for BLAS to start threads, which would take longer.
-    columns = rows_for(len(z), RESPONSE_TERMS + 6, z.shape[1], z.dtype)
+    columns = rows_for(len(x), RESPONSE_TERMS + 6, x.shape[1], x.dtype)
     others, tails, bends = np.split(columns[:, : RESPONSE_TERMS + 7], [5, 7], axis=1)
-    tail_terms(z, density, out=tails)
+    tail_terms(linear.z, erf_and_density(linear.z)[1], out=tails)
     tails *= steep[:, None]
     response_terms(x, scale, out=bends)
-    for k, row in enumerate((0, 1 + OFFSET, fit.values.shape[1])):
-        others[:, k] = fit.linear.rows.reshape(-1).take(first + row * length)
+    others[:, :3] = linear.rows[:, [0, 1 + OFFSET, fit.values.shape[1]]]
     np.multiply(x, scale, out=others[:, 3])
-    others[:, 4] = root
+    others[:, 4] = some.root
     products = (columns @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
     # The residual is the first row; the unknowns follow, with those of the shape last.
     rest = slice(1, RESPONSE_TERMS + 7)
@@ -171,7 +168,7 @@ def reshaped(fit: BatchFit, good: NDArray[np.bool_]) -> BatchFit:
 def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:
     """Attribute a shift of all edges towards the light side [px] to the response; `sigma` [px] is their blur.
 
-    Along an edge, shift and response look alike, and `profile_shape` leaves the shift to the offsets. Where
+    Along an edge, shift and response look alike, and `reshaped` leaves the shift to the offsets. Where
     edges cross, they do not.
     """
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
@@ -194,9 +191,10 @@ def with_gradients(fit: BatchFit, along: tuple[Single, Single], of_blur: bool, b
     fits stay as they are. Where the light is `bent`, as beside a shadow, it has second powers of the
     coordinates, too, and each fit tells its own variances: others nearby may lie beyond the border.
     """
-    data, rows, size = fit.pixels, fit.linear.rows, fit.values.shape[1]
+    data, linear, size = fit.pixels, fit.linear, fit.values.shape[1]
+    rows = linear.rows
     mean, contrast, sigma = fit.values[:, MEAN:].T.astype(np.float32)[:, :, None]
-    light = (mean + contrast * fit.linear.x) * data.root
+    light = (mean + contrast * linear.x) * data.root
     a, b = along
     patterns = [light * a, light * b]
     if of_blur:

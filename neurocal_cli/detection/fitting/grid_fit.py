@@ -316,7 +316,7 @@ def _fine_fit(
         # The error of the profile, estimated from a part of the pixels, now dominates: estimate it again.
         noise = PixelNoise.of(fit, grid_image.floor)
         fit = reshaped(fit, first.good)
-        fit = fit.continued(fit.shape, STEPS, weight=noise.weights(fit.linear.x))
+        fit = fit.continued(fit.shape, STEPS, weight=noise.weights(fit.x))
     if shading.has_borders and isinstance(fit.pixels, EdgePixels):
         along = fit.pixels.d, fit.pixels.lever * (0.5 * lines.length).astype(np.float32)[:, None]
         fit = with_gradients(fit, along, of_blur=False, bent=True)

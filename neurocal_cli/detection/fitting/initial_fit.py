@@ -151,7 +151,7 @@ def without_outlying_pixels(fit: BatchFit, steps: int) -> BatchFit:
     """
     for _ in range(_ROUNDS):
         rough = fit.chi2_per_pixel
-        off = fit.linear.residual**2 > _CONTRADICTS**2 * upper_median(rough)
+        off = fit.residual**2 > _CONTRADICTS**2 * upper_median(rough)
         few = np.count_nonzero(off, axis=1) < _MOST_CONTRADICTING * fit.count
         which = np.flatnonzero((rough > _roughest(fit, rough)) & few)
         if len(which):

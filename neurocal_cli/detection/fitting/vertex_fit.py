@@ -93,7 +93,7 @@ def fit_grid_vertices(
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
-    fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
+    fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.x))
     fit = without_outlying_pixels(fit, STEPS)
     fit = with_gradients(fit, (data.d1, data.d2), isinstance(blur, FieldBlur), fitted.shading.has_borders)
     if fitted.shifts.used:
