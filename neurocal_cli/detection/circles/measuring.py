@@ -27,6 +27,7 @@ from neurocal_cli.detection.circles.lattice import PlacedCircles, find_blobs, pl
 from neurocal_cli.detection.finding.saddles import interpolate
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
+    MEAN,
     BatchFit,
     FitPixels,
     LevelPrior,
@@ -59,7 +60,7 @@ from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 _REACH = 4.0  # sigma on both sides of the outline
-_ROUGHLY = 1.5  # of that, for a first selection
+_ROUGHLY = 1.5  # of that, for a first selection; and ratio of levels of noise, up to which one will do
 _TINY = 1e-9
 _ROOM = 0.5  # of the distance to the next circle; farther pixels may show it
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -90,8 +91,11 @@ def outline_pixels(
     band: tuple[float, float],
     shading: Shading | None,
     most: int,
+    among: tuple[Array, NDArray[np.bool_]] | None = None,
 ) -> CirclePixels:
     """Gather about `most` of the pixels around the outline of each circle at places (N, 2), padded.
+
+    They are `among` some pixels (N, M, 2) with a mask (N, M), if these are given.
 
     `radius` and the least and greatest distance of pixels from the centres, the `band`, are in the unit of
     the places, `blur` in px.
@@ -100,7 +104,7 @@ def outline_pixels(
     seen, reach = at.at(places[:, None] + samples), _REACH * blur
     middle, inverse = seen[:, 0], LocalInverse.of(seen, samples)
     outline = seen[:, 1 + 2 * len(_ANGLES) : 1 + 3 * len(_ANGLES)]
-    window, inside = _around(outline, reach, most)
+    window, inside = among or _around(outline, reach, most)
     point, d, normal, bend, rho, near = _distances(
         inverse, middle, radius, inverse.from_centre(window), inside, reach
     )
@@ -212,10 +216,11 @@ def measure_circles(
     apart = np.sqrt(2) if plane.asymmetric else 1.0
     blur, shading, some = _FIRST_BLUR, None, np.ones(len(places), dtype=np.bool_)
     band = _band(light, found.map, places, radius, _ROOM * apart)
+    start = noise = among = None
     for done in range(_MOST_ROUNDS):
         most = _FEW[done] if done < len(_FEW) else light.size
-        pixels = outline_pixels(light, found.map, places, radius, blur, band, shading, most)
-        fit = _fitted(pixels, blur, floor, shading is not None and shading.has_borders)
+        pixels = outline_pixels(light, found.map, places, radius, blur, band, shading, most, among)
+        fit, noise = _fitted(pixels, blur, floor, shading is not None and shading.has_borders, start, noise)
         sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
         if sharpening is not None:
             undone = sharpening.undone(raw, 2 * _pixel_radius(found.map, places, radius))
@@ -224,14 +229,20 @@ def measure_circles(
         centre = found.map.at(places) + fit.values[:, :2]
         mapped, departure = _mapped(raw, found, places, centre, fit, some)
         good = is_reliable(fit, departure) & _whole(found.map, places, radius, light.shape)
-        moved = np.sqrt(((mapped.map.at(places) - found.map.at(places)) ** 2).mean())
+        if done >= len(_FEW):  # the outlines move too little for others
+            before = (centre - fit.values[:, :2])[:, None]
+            among = before + np.stack([pixels.right, pixels.down], axis=2), pixels.root > 0
+        ahead = mapped.map.at(places)
+        moved = np.sqrt(((ahead - found.map.at(places)) ** 2).mean())
         found = mapped
         # The first blur may be far from the true one, which is_reliable does not allow.
         some = good if good.any() else fit.step < 1
         if not some.any():
             break
-        blur = upper_median(fit.values[some, BLUR])
-        radius *= 1 + upper_median(fit.values[some, 2]) / _pixel_radius(found.map, places, radius)
+        blur, growth = (upper_median(fit.values[some, k]) for k in (BLUR, 2))
+        radius *= 1 + growth / _pixel_radius(found.map, places, radius)
+        known = np.column_stack([centre - ahead, fit.values[:, 2] - growth, fit.values[:, MEAN:]])
+        start = np.where(good[:, None], known, np.nan)
         shading = board_shading(fit, found.map.at(places), some, found.map)
         if done >= len(_FEW) and moved < _SETTLED * np.sqrt(upper_median(fit.covariance[some, 0, 0])):
             break
@@ -303,8 +314,19 @@ def _pixel_radius(at: SmoothMap, places: Array, radius: float) -> float:
     return radius * upper_median(np.sqrt(np.abs(np.linalg.det(_steps(at, places)))))
 
 
-def _fitted(pixels: CirclePixels, blur: float, floor: float, borders: bool) -> BatchFit:
-    """Fit all circles: shift (2,), growth, levels and blur; the light may have `borders` of shadows."""
+def _fitted(
+    pixels: CirclePixels,
+    blur: float,
+    floor: float,
+    borders: bool,
+    known: Array | None,
+    noise: float | None,
+) -> tuple[BatchFit, float]:
+    """Fit all circles: shift (2,), growth, levels and blur; the light may have `borders` of shadows.
+
+    The values (N, 6) of circles that are `known` are the start. Returns also the noise of a pixel [DN^2], of
+    which a first value may be given.
+    """
     used = pixels.root > 0
     dark, light = (_mean(pixels.value, used & (sign * pixels.d > 0.5 * blur)) for sign in (-1, 1))
     usual = [upper_median(one[np.isfinite(one)]) if np.isfinite(one).any() else 0.0 for one in (dark, light)]
@@ -317,16 +339,20 @@ def _fitted(pixels: CirclePixels, blur: float, floor: float, borders: bool) -> B
     prior = LevelPrior(prior_mean, (1 / spread**2)[:, :, None] * np.eye(3))
     shape = ProfileShape(np.zeros((len(mean), 2)), np.zeros(RESPONSE_TERMS))
     start = np.concatenate([np.zeros((len(mean), 3)), prior_mean], axis=1)
-    noise = max(floor, (0.02 * upper_median(contrast)) ** 2)
-    weight = np.full_like(pixels.root, 1 / noise)
+    if known is not None:
+        start = np.where(np.isfinite(known), known, start)
+    first = max(floor, (0.02 * upper_median(contrast)) ** 2) if noise is None else noise
+    weight = np.full_like(pixels.root, 1 / first)
     fit = fit_batch(circle_model, pixels.weighed(weight), start, prior, shape, _STEPS)
-    scale = max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor / noise)
-    fit = fit.continued(shape, _STEPS, weight=weight / np.float32(scale))
+    noise = max(first * upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor)
+    if not 1 / _ROUGHLY < noise / first < _ROUGHLY:
+        first = noise
+        fit = fit.continued(shape, _STEPS, weight=np.full_like(weight, 1 / noise))
     along = pixels.right, pixels.down
     found = with_gradients(fit, along, of_blur=False, bent=False)
     if borders or found.values is not fit.values:  # where the light has other gradients, it is bent as well
         found = with_gradients(fit, along, of_blur=False, bent=True)
-    return found.scaled(max(upper_median(found.chi2_per_pixel), _LEAST_SCALE * floor / (noise * scale)))
+    return found.scaled(max(upper_median(found.chi2_per_pixel), _LEAST_SCALE * floor / first)), noise
 
 
 def _profile(pixels: CirclePixels, fit: BatchFit) -> EdgeProfile | None:
