@@ -15,6 +15,7 @@ from support.wrong_inputs import CAMERA, flat
 from neurocal_cli import calibrate, calibrate_rig, calibrate_stereo, read_calibration, read_points
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.files.result_files import write_calibration
+from neurocal_cli.simulation.rigs import random_rig
 
 KNOWN: dict[str, Any] = {"distortion": "none", "target": "given"}
 SAMPLES = Path(__file__).parents[2] / "sample_data"
@@ -58,6 +59,19 @@ def test_a_value_that_the_points_contradict_is_named(name: str, off: float) -> N
     found = calibrate(flat(6), skew=False, fix={name: wrong}, **KNOWN)
     assert verdict_on(found).word != "good"
     assert any(f"{name} = {wrong:g} is given" in reason for reason in verdict_on(found).reasons)
+
+
+def test_so_is_a_focal_length_that_a_selected_lens_could_take_in() -> None:
+    """With numbers of thousands that cancel, a rational lens is the right one times any factor."""
+    rng = np.random.default_rng(1)
+    points = random_rig("line", 2, 24, rng).points(0.15, rng)["cam1"]
+    found = calibrate(points, skew=False)
+    wrong = 1.03 * found.intrinsics.alpha_u
+    fixed = calibrate(points, skew=False, fix={"alpha_u": wrong})
+    assert np.abs(fixed.distortion).max() < 10
+    assert fixed.verdict is not None
+    assert fixed.verdict.word == "poor"
+    assert any("alpha_u = " in reason and "is given" in reason for reason in fixed.verdict.reasons)
 
 
 def test_coefficients_stay_at_their_values() -> None:

@@ -223,9 +223,14 @@ def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
 def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidate]:
     """Sound models; the other monotonic ones as well if they predict much better.
 
-    A single view cannot tell that, because errors of the target are common to all of its folds.
+    A single view cannot tell that, because errors of the target are common to all of its folds. Nor can views
+    if a focal length is given: large coefficients that cancel each other take in that it is wrong.
     """
-    monotonic = {name: c for name, c in fitted.items() if c.not_monotonic is None} or fitted
+    monotonic = {
+        name: c
+        for name, c in fitted.items()
+        if c.not_monotonic is None and not (c.noise and c.problem.fixed & {"alpha_u", "alpha_v"})
+    } or fitted
     sound = {name: c for name, c in monotonic.items() if c.sound}
     if not sound or not several:
         return sound or monotonic

@@ -23,7 +23,7 @@ from neurocal_cli.calibration.rig.rig import Rig, StereoRig
 from neurocal_cli.calibration.target_choice import can_tell, common_target, on_one_target
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import InputError, UsageError, plural
+from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError, plural
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, TargetChoice
@@ -106,7 +106,10 @@ def cameras_on_one_target(
     def calibrated(target: str | Target, starts: Sequence[Calibration | None]) -> list[Calibration]:
         cameras = [camera(name, target, start) for name, start in zip(names, starts, strict=True)]
         for k, model in _likely_models(cameras):
-            alike = camera(names[k], target, cameras[k], model)
+            try:
+                alike = camera(names[k], target, cameras[k], model)
+            except DegenerateGeometryError:  # its own points do not determine it
+                continue
             if alike.distortion_model == model:
                 cameras[k] = alike
                 if len(cameras) == 2:

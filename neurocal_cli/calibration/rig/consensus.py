@@ -12,7 +12,7 @@ pairs, each by its nearest one, are nearest in the median.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.reprojection import predicted_pixels
-from neurocal_cli.calibration.calibrate import calibrate, fit_poses
+from neurocal_cli.calibration.calibrate import CameraOptions, calibrate, fit_poses
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
 from neurocal_cli.calibration.rig.adjust import rig_problem
 from neurocal_cli.calibration.rig.frames import FrameNames, ViewPairs, frames_of_pairs
@@ -39,7 +39,6 @@ _SHARE = 0.1
 _SIGMAS = 30.0
 _HYPOTHESES = 40  # most pairs of which each is tried as the one that is right
 _EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
-_LIMITS = np.array([0.5, 1.0]) * _EXCHANGED  # which are tried for pairs from some frame on
 _NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
 _TURNED = "the target is turned by {} degrees in one of the images"
 _MIRRORED = "one of the two images is mirrored, or its u and v are exchanged"
@@ -123,47 +122,82 @@ def all_shifted(problem: RigProblem, neighbours: Mapping[str, Sequence[Pair]]) -
     return ""
 
 
-def exchanged(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> tuple[int, int, int] | None:
-    """How many pairs fit if two cameras have each other's images from some frame on; None if they have not.
+def changed(problem: RigProblem, a: int, b: int, place: NDArray[np.intp]) -> tuple[int, int, int] | None:
+    """How many more pairs of two cameras agree if all their relative poses change at some frame.
 
-    The other results are the last frame before that and the next one.
-    `place` (V,) is that of each frame in their sequence. From some place on, the relative poses of both with
-    all cameras must be those that the other one had before. That must explain most pairs that contradict the
-    rig.
+    The other results are the last frame before that and the next one. None if hardly any more agree.
+    `place` (V,) is that of each frame in their sequence.
     """
-    other = {a: b, b: a}
-    edges = [(a, b), *((one, c) for c in range(len(problem.cameras)) if c not in other for one in (a, b))]
     n = len(place)
-    agreed, n_pairs = np.zeros((len(_LIMITS), n + 1)), np.zeros(n, dtype=int)
-    for c, d in edges:
-        as_named, after = problem.of_two(c, d), problem.of_two(other[c], other.get(d, d))
-        sides = (as_named, c), (after, other[c])
-        offers = [_poses(two).rigs() for two, _ in sides if len(two.paired)]
-        if not offers:
-            continue
-        R, t = (np.concatenate(part) for part in zip(*offers, strict=True))
-        fits = np.zeros((2, len(_LIMITS), len(R), n + 1))
-        for own, (two, first) in zip(fits, sides, strict=True):
-            frames = place[problem.observations[first].view[two.paired_left]]
-            own[..., 1 + frames] = _distance(two, _poses(two), R, t) < _LIMITS[:, None, None]
-            n_pairs[frames] += two is as_named
-        # As named before each place, and exchanged from there on.
-        before, exchanged = fits.cumsum(axis=3)
-        agreed += (before + exchanged[..., -1:] - exchanged).max(axis=1)
-    seen = np.flatnonzero(n_pairs)
-    for some in agreed:
-        at = int(np.argmax(some))
-        gained = int(some[at] - some[-1])
-        if gained >= 2 * LEAST_AGREED and gained > AGREED * (n_pairs.sum() - some[-1]):
-            last, first = seen[seen < at].max(initial=0), seen[seen >= at].min(initial=n - 1)
-            return gained, int(last), int(first)
-    return None
+    agreed, is_seen = np.zeros(n + 1), np.zeros(n, dtype=bool)
+    for two, first in _with_any(problem, a, b):
+        frames = place[problem.observations[first].view[two.paired_left]]
+        poses = _poses(two)
+        R, t = poses.rigs()
+        fits = np.zeros((len(R), n + 1))
+        fits[:, 1 + frames] = _distance(two, poses, R, t) < 1
+        before = fits.cumsum(axis=1)
+        agreed += before.max(axis=0) + (before[:, -1:] - before).max(axis=0)
+        is_seen[frames] = True
+    at, seen = int(np.argmax(agreed)), np.flatnonzero(is_seen)
+    gained = int(agreed[at] - agreed[-1])
+    if gained < LEAST_AGREED:
+        return None
+    return gained, int(seen[seen < at].max(initial=0)), int(seen[seen >= at].min(initial=n - 1))
+
+
+def mended_by_exchange(problem: RigProblem, a: int, b: int, is_late: NDArray[np.bool_]) -> int:
+    """How many more pairs agree on a rig if two cameras exchange their images of late frames (V,).
+
+    Both are calibrated again from the images that are theirs then, as lenses that differ move all poses.
+    """
+    cameras, frames = list(problem.calibrations), [observed.view for observed in problem.observations]
+    for own, other in ((a, b), (b, a)):
+        parts = [_of_frames(problem, own, ~is_late), _of_frames(problem, other, is_late)]
+        world, pixels, views = (np.concatenate(part) for part in zip(*parts, strict=True))
+        before = problem.calibrations[own]
+        known: CameraOptions = {"skew": False, "target": "given"}
+        if before.type == 3:
+            known |= {"type": 3, "intrinsics": before.camera}
+        points = Correspondences(world, pixels, views, before.image_size, unit=before.unit)
+        try:
+            cameras[own] = calibrate(points, **known)
+        except NeurocalError:
+            return 0
+        frames[own] = np.array([int(name) for name in cameras[own].points.view_names])
+    numbers = np.unique(np.concatenate(frames), return_inverse=True)[1]
+    found = rig_problem(cameras, np.split(numbers, np.cumsum([len(own) for own in frames[:-1]])))
+    left, odd = (sum(sum(map(bool, find_consensus(two).reasons)) for two, _ in _with_any(of, a, b))
+                 for of in (found, problem))  # fmt: skip
+    return odd - left
+
+
+def _with_any(problem: RigProblem, a: int, b: int) -> Iterator[tuple[RigProblem, int]]:
+    """The problems of two cameras, and of each of them with any other one; and the first camera of each."""
+    others = [c for c in range(len(problem.cameras)) if c not in (a, b)]
+    for c, d in [(a, b), *((one, c) for c in others for one in (a, b))]:
+        two = problem.of_two(c, d)
+        if len(two.paired):
+            yield two, c
+
+
+def _as_given(camera: Calibration) -> Correspondences:
+    return camera.points if camera.target is None else camera.target.as_given(camera.points)
+
+
+def _of_frames(
+    problem: RigProblem, side: int, some: NDArray[np.bool_]
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Points of a camera in some of the frames, (V,), as given, with their pixels and frames."""
+    points = _as_given(problem.calibrations[side])
+    frame = problem.observations[side].view[points.view_index]
+    return points.world[some[frame]], points.pixels[some[frame]], frame[some[frame]]
 
 
 def exchanged_lenses(
     problem: RigProblem, suspects: Sequence[int], place: NDArray[np.intp]
 ) -> dict[tuple[int, int], tuple[int, int, int]]:
-    """As `exchanged`, of all pairs of some cameras, by how many frames clearly fit the lenses of both.
+    """As `changed`, of all pairs of some cameras, by how many frames clearly fit the lenses of both.
 
     Files with images of several cameras may tell none of their poses. Lenses are those of the first third of
     the views of each file, or of the last third, of which one is by one camera.
@@ -171,9 +205,7 @@ def exchanged_lenses(
     found: dict[tuple[int, int], tuple[int, int, int]] = {}
     sides = {}
     for c in suspects:
-        one = problem.calibrations[c]
-        points = one.points if one.target is None else one.target.as_given(one.points)
-        sides[c] = points, place[problem.observations[c].view]
+        sides[c] = _as_given(problem.calibrations[c]), place[problem.observations[c].view]
     for is_late in (False, True):
         try:
             lenses = {c: _of_third(*side, is_late) for c, side in sides.items()}

@@ -23,6 +23,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import RigFit, is_significant
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA, along, seen_by
 from neurocal_cli.calibration.rig.consensus import (
+    AGREED,
     EXCHANGED,
     LEAST_AGREED,
     NEIGHBOUR,
@@ -33,9 +34,10 @@ from neurocal_cli.calibration.rig.consensus import (
     UNSYNCHRONISED,
     RigConsensus,
     all_shifted,
-    exchanged,
+    changed,
     exchanged_lenses,
     find_consensus,
+    mended_by_exchange,
     with_shifted,
 )
 from neurocal_cli.calibration.rig.frames import FrameNames, groups
@@ -49,8 +51,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 
 _PARTNERS = 4  # cameras with which each camera is compared, those with which it has most frames in common
 # Cameras of which two may have been exchanged, those that contradict the largest share of pairs; and those
-# whose lenses are compared.
-_SUSPECTS, _WITH_LENSES = 6, 3
+# whose lenses are compared; and pairs of which the exchange is undone.
+_SUSPECTS, _WITH_LENSES, _TRIED = 6, 3, 4
 
 # Share of the frames of an edge that must agree on one relative pose: where the target moves between late
 # images, only those in which it is slow agree.
@@ -289,15 +291,19 @@ def exchanged_cameras(
     found = {}
     for a, b in combinations(suspects, 2):
         others = sum(len(e.consensus.reasons) - e.n_agreed for e in edges if {a, b}.isdisjoint(e.cameras))
-        one = exchanged(problem, a, b, place)
+        one = changed(problem, a, b, place)
         if one is not None and one[0] > others:
             found[a, b] = one
+    likely = sorted(found.items(), key=lambda one: -one[1][0])[:_TRIED]
+    mended = {pair: mended_by_exchange(problem, *pair, place >= first) for pair, (_, _, first) in likely}
+    enough = {pair: max(2 * LEAST_AGREED, AGREED * gained) for pair, (gained, _, _) in likely}
+    found = {pair: found[pair] for pair, n in mended.items() if n >= enough[pair]}
     worst = [c for c in suspects if c in most[:_WITH_LENSES]]
     if not found and any(_is_of_several(problem.calibrations[c]) for c in worst):
         found = exchanged_lenses(problem, worst, place)
     if not found:
         return ""
-    (a, b), (_, *around) = max(found.items(), key=lambda one: one[1])
+    (a, b), (_, *around) = max(found.items(), key=lambda one: mended.get(one[0], one[1][0]))
     last, first = (next(iter(problem.views[sequence[k]].values())) for k in around)
     return (
         f"the images of cameras {names[a]} and {names[b]} were exchanged between {last} and {first}; "

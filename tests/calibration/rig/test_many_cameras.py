@@ -405,6 +405,19 @@ def test_so_are_those_of_lenses_that_differ(seed: int, sigma: float) -> None:
         calibrate_rig(points, skew=False, distortion="fisheye", target="given")
 
 
+@pytest.mark.parametrize("seed", slow_but((1,), range(8)))
+def test_so_are_those_that_are_far_from_a_small_board(seed: int) -> None:
+    """Its poses in a lens with another centre and focal length are off by more than its own size."""
+    rng = np.random.default_rng(seed)
+    rig = random_rig("line", 3, 30, rng)
+    points = replace(rig, board=rig.board / 3).points(0.15, rng)
+    first, second = points["cam1"], points["cam2"]
+    for name, before, after in (("cam1", first, second), ("cam2", second, first)):
+        points[name] = joined(of_frames(before, lambda k: k < 15), of_frames(after, lambda k: k >= 15))
+    with pytest.raises(NeurocalError, match="the images of cameras cam1 and cam2 were exchanged between"):
+        calibrate_rig(points, skew=False, distortion="k1k2", target="given")
+
+
 def test_the_exchanged_images_of_one_frame_are_named() -> None:
     _, points = scene("line", 4, 20)
     one, other = points["cam1"], points["cam2"]
