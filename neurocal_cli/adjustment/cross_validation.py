@@ -206,10 +206,14 @@ class Minimum:
         """The error of each view, with its pose eliminated."""
         return reduced(self.normal, self.free, self.free_poses)
 
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        return int(self.free.sum()) + 6 * len(self.normal) * self.free_poses
+
     def variance(self, n_equations: float) -> float:
         """Variance of the residuals of so many equations: two for most points; see `measured_directions`."""
-        unknowns = int(self.free.sum()) + (6 * len(self.normal) if self.free_poses else 0)
-        return float(self.normal[:, -1, -1].sum()) / max(n_equations - unknowns, 1)
+        return float(self.normal[:, -1, -1].sum()) / max(n_equations - self.unknowns, 1)
 
     def covariance(self, n_equations: float, shared: Array | None = None) -> Covariance:
         """From the normal matrices; for so many equations, and for `shared`, see there and `Arrowhead`."""

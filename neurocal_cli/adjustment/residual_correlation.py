@@ -9,11 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.reprojection import residuals
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.cross_validation import Minimum, quietly
+from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, derivatives, residuals
+from neurocal_cli.adjustment.views import Views, batches_of
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.observations.measured_directions import measured_part, single, unit
+from neurocal_cli.observations.measured_directions import across_first, measured_part, single, unit
 
 _SOME_SAY = 0.5  # least weight along edges with which residuals in that direction are used
 
@@ -24,8 +25,70 @@ def correlation(views: Views, errors: Array) -> float:
     It is 0 for noise, to 1 / sqrt(N), and 1 for residuals that vary slowly over the image. `errors` (N, 2)
     are the points' residuals in the order of `views`; directions that were not measured are ignored.
     """
-    group, n_groups = views.index, views.n_views
-    across = views.across if views.along < _SOME_SAY else None
+    across, (order, joined) = _across(views), _in_rows(views)
+    one, two = order[:-1][joined], order[1:][joined]
+    errors = measured_part(errors, across)
+    shared = [
+        measured_part(errors[k], None if across is None else across[n]) for k, n in ((one, two), (two, one))
+    ]
+    power = (shared[0] ** 2).sum() + (shared[1] ** 2).sum()
+    return float(2 * (errors[one] * errors[two]).sum() / power) if power > 0 else 0.0
+
+
+@quietly
+def shared_noise(m: Minimum) -> tuple[float, float]:
+    """Correlation of the noise of neighbouring points, and how many standard deviations it is above 0.
+
+    Of whitened noise w the unknowns take in H w and leave e = (1 - H) w. If w is white, of variance s^2,
+    E[e_i . e_j] = s^2 tr(delta_ij - H_ij), where s^2 H_ij = J_i C J_j^T with the derivatives J of the points
+    and the covariance C of the unknowns. So with tr(J_i C J_j^T) added, the products of neighbours have the
+    mean 0, whatever the weights, the target and the number of views. Products of independent residuals are
+    uncorrelated: the variance of their sum is the sum of their squares. Of noise that is shared the unknowns
+    take in as many times more as it is worth fewer residuals. An estimated target, which is not among the
+    unknowns here, makes all residuals smaller. Without noise both numbers are nan.
+    """
+    views, known, (order, joined) = m.views, m.covariance(m.views.n_equations), _in_rows(m.views)
+    whitening, across, to_next = views.whitening, _across(views), np.append(joined, 0.0)
+    if whitening is not None:
+        if across is not None:  # these residuals have the signs of their directions
+            whitening, n = across_first(whitening, across), unit(across)[order]
+            alike = (n[1:] * n[:-1]).sum(axis=1)
+            to_next[:-1] *= np.where(single(n)[1:] | single(n)[:-1], alike, 1.0)
+        whitening = whitening[order]
+    batches, laid = (
+        batches_of(views.local[order], pixels, factors, views.index, views.n_views)
+        for pixels, factors in ((views.pixels[order], whitening), (to_next[:, None] * [1.0, 1.0], None))
+    )
+    C = np.zeros((views.n_views, *m.normal[0, :-1, :-1].shape))
+    shared, own = m.columns, POSE_COLUMNS[: known.own.shape[1]]
+    C[:, shared[:, None], shared], C[:, own[:, None], own] = known.shared, known.own
+    C[:, shared[:, None], own], C[:, own[:, None], shared] = known.cross, np.swapaxes(known.cross, 1, 2)
+    memory = batches.memory(m.normal.shape[1], m.state.square)
+    products, power, square = np.zeros(2), np.zeros(2), 0.0  # of the residuals, and taken in
+    for chunk in batches.chunks():
+        rows, here = memory[: chunk.stop - chunk.start, :-1], laid.pixels[chunk, 0, :-1]
+        derivatives(batches, chunk, m.state, rows)
+        e, J = rows[:, -1:], rows[:, :-1]
+        moved = (C[batches.view[chunk]] @ J.reshape(*J.shape[:2], -1)).reshape(J.shape)
+        both = [(e, e), (moved, J)]
+        joint = np.stack([np.einsum("tcin,tcin->tn", a[..., :-1], b[..., 1:]) for a, b in both]) * here
+        size = np.stack([np.einsum("tcin,tcin->tn", a, b) for a, b in both])
+        products += joint.sum(axis=(1, 2))
+        power += 0.5 * (size[..., :-1] + size[..., 1:])[:, here != 0].sum(axis=1)
+        square += float((joint.sum(axis=0) ** 2).sum())
+    rho = float(products.sum() / power.sum())
+    taken = np.array([1.0, views.n_equations / effective_number(views.n_equations, rho, views.side)])
+    return float(products @ taken / (power @ taken)), float(products.sum() / np.sqrt(square))
+
+
+def _across(views: Views) -> Array | None:
+    """Directions (N, 2) in which alone points were measured; None if those along edges count as well."""
+    return views.across if views.along < _SOME_SAY else None
+
+
+def _in_rows(views: Views) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Order (N,) in which neighbours follow each other in rows, and whether one has a next (N - 1,)."""
+    group, n_groups, across = views.index, views.n_views, _across(views)
     if across is not None:
         # Edges of the two orientations measure different directions, so each point is paired within its own.
         group, n_groups = 2 * group + _other_way(views, across), 2 * n_groups
@@ -38,14 +101,7 @@ def correlation(views: Views, errors: Array) -> float:
     # One number sorts by group, strip and u: three sorts take three times as long.
     order = np.argsort(2 * (group * (strips.max() + 2) + strip) + along, kind="stable")
     one, two = order[:-1], order[1:]
-    same = (group[one] == group[two]) & (strip[one] == strip[two])
-    one, two = one[same], two[same]
-    errors = measured_part(errors, across)
-    shared = [
-        measured_part(errors[k], None if across is None else across[n]) for k, n in ((one, two), (two, one))
-    ]
-    power = (shared[0] ** 2).sum() + (shared[1] ** 2).sum()
-    return float(2 * (errors[one] * errors[two]).sum() / power) if power > 0 else 0.0
+    return order, (group[one] == group[two]) & (strip[one] == strip[two])
 
 
 def _other_way(views: Views, across: Array) -> NDArray[np.int64]:

@@ -71,6 +71,11 @@ class Views:
         return len(self.names)
 
     @property
+    def side(self) -> float:
+        """Number of points along the side of a view whose points are a square grid; of the mean view."""
+        return float(np.sqrt(np.mean(self.counts)))
+
+    @property
     def rank(self) -> NDArray[np.intp]:
         """(N,) number of each point within its view, from 0."""
         return np.arange(len(self.index)) - np.repeat(self.first, self.counts)

@@ -133,7 +133,6 @@ def _covariance_of(solution: Solution) -> CameraCovariance:
             solution.by_prior,
             solution.target_kept,
             solution.covariance if solution.target is None else None,
-            solution.alike,
         )
     )
 

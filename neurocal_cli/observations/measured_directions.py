@@ -67,6 +67,12 @@ def rounded(whitening: Array, across: Array | None) -> Array:
     return np.where(single(across)[:, None], np.column_stack([w, np.zeros_like(w), w]), whitening)
 
 
+def across_first(whitening: Array, across: Array) -> Array:
+    """Whitening factors (N, 3), for one residual across an edge and 0 as the other."""
+    factors = rounded(whitening, across)[:, :1] * unit(across)
+    return np.where(single(across)[:, None], np.column_stack([factors, np.zeros(len(factors))]), whitening)
+
+
 def single(across: Array) -> NDArray[np.bool_]:
     """Which points (N,) were measured in one direction only."""
     return np.asarray((across != 0).any(axis=1))

@@ -61,12 +61,16 @@ def dense_covariance(cal: Calibration, type: int) -> Array:
     return found
 
 
+def reported(cal: Calibration) -> Array:
+    """Standard deviations of all the parameters."""
+    of_poses = [view.std[name] for view in cal.views.values() for name in POSE_NAMES]
+    return np.array([cal.std[name] for name in INTRINSIC_NAMES] + of_poses)
+
+
 def assert_std(cal: Calibration, type: int, relative: float = 1e-5) -> None:
     dense = dense_covariance(cal, type)
     std = np.sqrt(np.diagonal(dense))
-    reported = [cal.std[name] for name in INTRINSIC_NAMES]
-    reported += [view.std[name] for view in cal.views.values() for name in POSE_NAMES]
-    np.testing.assert_allclose(reported, std, rtol=relative)
+    np.testing.assert_allclose(reported(cal), std, rtol=relative)
     rows = [INTRINSIC_NAMES.index(name) for name in cal.covariance_names]
     limit = relative * std[rows][:, None] * std[rows]
     assert (np.abs(cal.covariance - dense[np.ix_(rows, rows)]) <= limit).all()
@@ -86,10 +90,18 @@ def test_std_and_covariance_of_a_solid_target(type: int, skew: bool, weights: st
 @pytest.mark.parametrize("skew", slow_but((False,), [True, False]))
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_std_and_covariance_of_flat_boards(type: int, skew: bool, weights: str) -> None:
+    """By chance views contradict each other in one draw of twenty, and share their noise in another one."""
     rng = np.random.default_rng(type)
     scene = random_flat_set(np.random.default_rng(3), 4, skew, cols=9, rows=6)
-    found = pinhole(noisy(scene, weights, rng), skew=skew, target="given", **scene.given(type))
-    assert_std(found, type)
+    as_dense = 0
+    for _ in range(8):
+        found = pinhole(noisy(scene, weights, rng), skew=skew, target="given", **scene.given(type))
+        std = np.sqrt(np.diagonal(dense_covariance(found, type)))
+        assert (reported(found) >= (1 - 1e-5) * std).all()
+        if np.allclose(reported(found), std, rtol=1e-5):
+            assert_std(found, type)
+            as_dense += 1
+    assert as_dense >= 5
 
 
 def test_std_of_theta_and_alpha_v_with_axes_that_are_far_from_perpendicular() -> None:
@@ -156,7 +168,7 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_views", "trials", "least"), slow_but((), [(5, 40, 0.55), (5, 400, 0.6), (20, 150, 0.8)])
+    ("n_views", "trials", "least"), slow_but((), [(5, 40, 0.55), (5, 400, 0.6), (20, 600, 0.8)])
 )
 def test_the_std_is_the_spread_over_many_noises(n_views: int, trials: int, least: float) -> None:
     """Never less, and more by what it costs to count views: the variance between five of them is rough."""
@@ -164,12 +176,7 @@ def test_the_std_is_the_spread_over_many_noises(n_views: int, trials: int, least
     scene = random_flat_set(np.random.default_rng(3), n_views, True, cols=9, rows=6)
     results = [pinhole(noisy(scene, "suu,suv,svv", rng)) for _ in range(trials)]
     values = np.array([parameters(cal) for cal in results])
-    std = np.array(
-        [
-            [cal.std[n] for n in INTRINSIC_NAMES] + [v.std[n] for v in cal.views.values() for n in POSE_NAMES]
-            for cal in results
-        ]
-    )
+    std = np.array([reported(cal) for cal in results])
     # The noise of each result is drawn anew with its covariances, which all have one distribution;
     # n draws know a standard deviation to 1 / sqrt(2 n), the largest of 35 to 4 times that.
     ratio = values.std(axis=0) / np.sqrt((std**2).mean(axis=0))

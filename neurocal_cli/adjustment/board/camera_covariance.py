@@ -18,7 +18,7 @@ from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.normal_equations import Covariance
 from neurocal_cli.adjustment.problem import translations
 from neurocal_cli.adjustment.reprojection import normal_blocks
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.residual_correlation import effective_number, shared_noise
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.points import Correspondences
@@ -50,7 +50,6 @@ class CameraSeen:
     target_kept: bool = False  # whether the given target was kept although it could have been estimated
     # From the normal matrices alone, if it is known already and the target is as given.
     plain: Covariance | None = None
-    alike: float | None = None  # correlation of the residuals of neighbouring points, if it is known already
 
 
 @frozen_dataclass(eq=False)
@@ -106,7 +105,8 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
         assert m.repeated is not None
         few = _GROWN_OF_FEW if m.repeated.n_groups <= _FEW else np.inf
         grown = few if seen.target.bends is None else _GROWN
-    found, worth, counted = counting_views(plain, m, n, basis.moves_without, grown), _worth(seen), 1.0
+    found, worth = counting_views(plain, m, n, basis.moves_without, grown), _worth(seen.minimum)
+    counted = 1.0
     if m.free_poses and m.free.any():  # with a given camera, residuals are alike where it is wrong
         found = replace(found, alone=found.alone / worth)
         if found.shared is plain.shared:  # views that contradict each other tell more, if they are many
@@ -152,19 +152,10 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     return replace(known, found=found, wide=wide)
 
 
-def _worth(seen: CameraSeen) -> float:
-    """Effective number of residuals over their number, if neighbours share their noise.
-
-    The unknowns take in what varies slowly: white noise of which the slowest share q is taken out leaves
-    residuals with the correlation -sin(pi q) / (pi (1 - q)) in a row.
-    """
-    m, n = seen.minimum, seen.minimum.views.n_equations
-    alike = correlation(m.views, point_residuals(m.views, m.state)) if seen.alike is None else seen.alike
-    q = min((int(m.free.sum()) + 6 * m.views.n_views * m.free_poses) / n, 1.0)
-    alike = alike * (1.0 - q) + float(np.sin(np.pi * q)) / np.pi
-    if not alike * np.sqrt(len(m.views.index)) > CHANCE:
-        return 1.0
-    return effective_number(n, alike) / n
+def _worth(m: Minimum) -> float:
+    """Effective number of residuals over their number, if neighbours share their noise."""
+    n, (alike, deviations) = m.views.n_equations, shared_noise(m)
+    return effective_number(n, alike, m.views.side) / n if deviations > CHANCE else 1.0
 
 
 def _basis(seen: CameraSeen, m: Minimum, shared: Array | None = None) -> CovarianceBasis:

@@ -341,8 +341,7 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
     The correlation is that of the closest fit, because a model that is too simple adds correlation.
     """
     closest = min(fitted, key=lambda candidate: candidate.cost).adjusted.state
-    side = float(np.sqrt(np.mean(views.counts)))
-    return independent_residuals(views, closest, side)
+    return independent_residuals(views, closest, views.side)
 
 
 def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:

@@ -125,7 +125,6 @@ class Evidence:
         state = normalised(self.given, self.views)
         adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
         self.state, self.cost = adjusted.state, float(adjusted.normal[:, -1, -1].sum())
-        self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.errors = point_residuals(self.views, self.state)
         self.repeated = repeated_poses(self.views, self.state, self.errors)
         self.seen = CameraSeen(
@@ -133,7 +132,7 @@ class Evidence:
             self.points, calibration.target, choice=tuple(calibration.lens_choice),
             target_kept=calibration.target_stretched > 0,
         )  # fmt: skip
-        known = camera_covariance(self.seen)
+        known, self.unknowns = camera_covariance(self.seen), self.seen.minimum.unknowns
         self.minimum = known.basis.minimum
         self.spare = max(known.basis.n_equations - self.unknowns, 1)
         self.variance = self.cost / self.spare
