@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import field, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,32 +198,26 @@ class _Seen:
 
     def add(self, image: NDArray[np.generic], *, all_kinds: bool) -> bool:
         """Look for the kinds that were seen before, and then for the others; whether one is seen."""
-        if self.marked and self._add_marked(image):
-            return True
-        if self.circles and self._add_circles(image):
+        if self._add_others(image, seen_before=True):
             return True
         board = seen_board(image)
-        others = all_kinds and not self.squares
         # A floor may be a chessboard, too, that the image cuts off.
         unsure = board is None or not board.plain or board.vote is Vote.NONE
-        if others and unsure and not self.marked and self._add_marked(image):
+        others = all_kinds and unsure and not self.squares
+        if others and self._add_others(image, seen_before=False):
             return True
         if board is not None:
             (self.squares if board.plain else self.patterned).append(board)
-            return board.plain
-        return others and not self.circles and self._add_circles(image)
+        return board is not None and board.plain
 
-    def _add_marked(self, image: NDArray[np.generic]) -> bool:
-        found = seen_markers(image)
-        if found:
-            self.marked.append(found)
-        return bool(found)
-
-    def _add_circles(self, image: NDArray[np.generic]) -> bool:
-        found = seen_circles(image)
-        if found is not None:
-            self.circles.append(found)
-        return found is not None
+    def _add_others(self, image: NDArray[np.generic], *, seen_before: bool) -> bool:
+        """Look for markers and circles, if they were seen before or if not; whether they are seen."""
+        looks: Any = ((self.marked, seen_markers), (self.circles, seen_circles))
+        for every, look in looks:
+            if bool(every) == seen_before and (found := look(image)):
+                every.append(found)
+                return True
+        return False
 
     @property
     def kind(self) -> Sequence[object]:

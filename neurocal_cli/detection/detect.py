@@ -132,7 +132,7 @@ def detect_points(
         The image has another shape or type, or pixels that are not finite.
     """
     image = grey_image(image)
-    if is_inverted(board):
+    if any(plane.markers is not None and plane.markers.inverted for plane in board.planes):
         # The response is that of the light, not of its negative.
         image, gamma = negative(image if gamma is None else linearised(image, gamma)), None
     identified = _identified(image, board, grids)
@@ -194,14 +194,10 @@ def _all_measured(
     return tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
 
 
-def is_inverted(board: Board) -> bool:
-    """Whether light and dark are exchanged on a board with markers."""
-    return any(plane.markers is not None and plane.markers.inverted for plane in board.planes)
-
-
 def grids_in(image: NDArray[np.generic], board: Board) -> list[Grid]:
     """The chessboards in an image that may be planes of the board; none for other kinds of boards."""
-    return find_grids(image, wanted_sizes(board)) if is_plain(board) else []
+    sizes = [(plane.cols, plane.rows) for plane in board.planes] if len(board.planes) == 1 else []
+    return find_grids(image, sizes) if is_plain(board) else []
 
 
 def is_plain(board: Board) -> bool:
@@ -232,11 +228,6 @@ def _named(located: Located, measured: Measured) -> Measured:
     """Leave out points that the board does not name, which do not count as rejected."""
     named = np.array([bool(name) for name in label(located, measured).ids], dtype=bool)
     return measured if named.all() else replace(measured.only(named), rejected=measured.rejected)
-
-
-def wanted_sizes(board: Board) -> list[tuple[int, int]]:
-    """Size of a single-plane board, for `find_grids`; empty for several planes."""
-    return [(plane.cols, plane.rows) for plane in board.planes] if len(board.planes) == 1 else []
 
 
 def _directions(measured: Measured) -> Array:

@@ -30,6 +30,7 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.placement import (
     NEARER,
+    ONE_BOARD,
     SYMMETRIC_BOARD,
     End,
     NoBoardError,
@@ -37,7 +38,6 @@ from neurocal_cli.detection.placement import (
     ambiguous,
     board_ends,
     placements,
-    surrounded,
     trimmed,
     wrong_size,
 )
@@ -138,7 +138,7 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
     ends = board_ends(grey, grid) if alone or not alike else {}
     if not alone:  # the pattern of another plane continues beyond a fold
         ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
-    elif not alike and surrounded(ends):
+    elif not alike and set(ends.values()) <= {End.BOARD, End.STOPS}:
         return _Candidate(grid, (), False, ends)  # this is all of another board, or a lit part of the board
     possible = [
         placement
@@ -172,8 +172,7 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
         alike.sort(key=lambda c: -c.grid.square)
         if len(alike) > room and alike[room - 1].grid.square < NEARER * alike[room].grid.square:
             raise NoBoardError(
-                f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; show only one of "
-                "them"
+                f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; {ONE_BOARD}"
             )
         kept += alike[:room]
     return sorted(kept, key=lambda c: -int(c.grid.seen.sum()))

@@ -95,11 +95,6 @@ def _margin_follows(profile: Array, margin: float) -> bool:
     return bool(((np.abs(profile - margin) < _SAME).mean(axis=0) >= _SHARE)[_STEPS > 1].any())
 
 
-def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
-    """Whether the pattern is seen to stop at all sides of a grid."""
-    return len(ends) == len(DIRECTIONS) and set(ends.values()) <= {End.BOARD, End.STOPS}
-
-
 def seen_size(grid: Grid, ends: Mapping[tuple[int, int], End]) -> tuple[int, int]:
     """Columns and rows of a grid with its lines beside squares that are cut."""
     cols, rows = (
@@ -252,6 +247,7 @@ _FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a c
 # for boards, and at most 0.77 for blinds, tiled floors and textures. It changes only a message.
 _WHOLE = 0.8
 
+ONE_BOARD = "show only one of them, or cut pictures that hold both images of a stereo camera apart"
 NEARER = 1.5  # ratio of the sizes above which the larger of two equal boards is preferred
 
 SYMMETRIC_BOARD = (

@@ -85,8 +85,9 @@ def test_the_side_of_the_markers_is_told_by_one_between_four_vertices() -> None:
     assert found.plane.markers.side == pytest.approx(22 / 30, abs=0.004)  # 0.7
 
 
-def test_a_floor_of_squares_does_not_hide_a_board_with_markers() -> None:
-    picture = taken(marked_scene(plane_of("charuco:6x5:40:28:DICT_5X5_50"), 3, square=36.0), 3, 2)
+@pytest.mark.parametrize("form", ["charuco:6x5:1:0.7:DICT_5X5_50", "circles:6x5:1:0.6"])
+def test_a_floor_of_squares_does_not_hide_a_board(form: str) -> None:
+    picture = taken(marked_scene(plane_of(form), 3, square=28.0), 3, 2)
     vertices = picture.truth.planes[0].vertices.reshape(-1, 2)
     outline = cv2.convexHull(vertices.astype(np.float32)).reshape(-1, 2)
     paper = np.zeros(picture.image.shape, dtype=np.uint8)
@@ -96,7 +97,7 @@ def test_a_floor_of_squares_does_not_hide_a_board_with_markers() -> None:
     v, u = np.indices(paper.shape)
     floor = np.where((u // 18 + v // 18) % 2 == 0, 50.0, 190.0)
     image = np.where(paper > 0, picture.image, cv2.GaussianBlur(floor, (0, 0), 0.8)).round().astype(np.uint8)
-    assert found_words(found_board([image]).plane) == found_words(plane_of("charuco:6x5:1:0.7:DICT_5X5_50"))
+    assert found_words(found_board([image]).plane) == found_words(plane_of(form))
 
 
 @pytest.mark.parametrize("gamma", [0.6, 2.2])

@@ -29,7 +29,7 @@ from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import predict_vertices
 from neurocal_cli.detection.finding.saddles import Image, Level, dense_parts, grey_levels, interpolate
 from neurocal_cli.detection.markers.lattice import flattening_of, leave_out_strays
-from neurocal_cli.detection.placement import NEARER, NoBoardError
+from neurocal_cli.detection.placement import NEARER, ONE_BOARD, NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 _WINDOWS = (0.02, 0.06, 0.18)  # of the threshold, over the image's longer side
@@ -246,10 +246,7 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     found, area = blobs.centre[at], blobs.area[at].astype(float)
     alike = [list(one.values()) for one in others if len(one) == count]
     if any(NEARER**2 * np.median(blobs.area[one]) > np.median(area) for one in alike):
-        raise NoBoardError(
-            f"two grids of {plane.cols} x {plane.rows} circles are detected; show only one of them, or cut "
-            "pictures that hold both images of a stereo camera apart"
-        )
+        raise NoBoardError(f"two grids of {plane.cols} x {plane.rows} circles are detected; {ONE_BOARD}")
     size = grey.shape[1], grey.shape[0]
     leave_out_strays(index.astype(float), found, area, flattening_of(index.astype(float), found, size))
     kept = np.isfinite(area)
@@ -261,7 +258,8 @@ def place_circles(plane: CirclePlane, blobs: Blobs, grey: NDArray[np.uint8]) -> 
     departure, _ = departure_from_circles(light, places, placed.centre, placed.area, described=True)
     if departure > _DEPARTURE:
         raise NoBoardError(
-            "the image shows marks in rows and columns, but no circles of one colour on blank paper"
+            "the image shows marks in rows and columns, but no circles of one colour on blank paper; if "
+            "they are the board, avoid reflections and shadows on it"
         )
     return placed
 

@@ -38,7 +38,7 @@ from neurocal_cli.detection.markers.reading import (
     looks_at,
     markers_in,
 )
-from neurocal_cli.detection.placement import NoBoardError, Placement
+from neurocal_cli.detection.placement import ONE_BOARD, NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import TagPlane
@@ -79,10 +79,7 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
             continue
         number, times = np.unique(placed.read.number, return_counts=True)
         if times[np.isin(number, placed.marks.number)].mean() > _TWICE:
-            raise NoBoardError(
-                "two boards with the same markers are detected; show only one of them, or cut pictures that "
-                "hold both images of a stereo camera apart"
-            )
+            raise NoBoardError(f"two boards with the same markers are detected; {ONE_BOARD}")
         if isinstance(plane, TagPlane) and plane.downwards:
             _check_spacing(plane, placed.marks)
         found, agree = _vertices(plane, placed, light), len(np.unique(placed.at))

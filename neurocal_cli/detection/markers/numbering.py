@@ -199,7 +199,8 @@ def numbered(lies: Sequence[Lie]) -> Numbering | None:
         for way in _ways(lie.tags):
             offsets = _offsets(lie, way)
             count = int(np.bincount(offsets - offsets.min()).max())
-            key = way.cols, _is_as_text(way)
+            (a, b), (c, d) = way.axes
+            key = way.cols, a * d - b * c > 0  # as text
             if count > mine.get(key, (0, way))[0]:
                 mine[key] = count, way
         best.append(mine)
@@ -215,11 +216,6 @@ def numbered(lies: Sequence[Lie]) -> Numbering | None:
             kept = lie.only(offsets == Counter(offsets.tolist()).most_common(1)[0][0])
             found.append(Numbered(source, kept, axes, kept.index @ axes.T))
     return Numbering(*key, tuple(found)) if found else None
-
-
-def _is_as_text(way: _Way) -> bool:
-    (a, b), (c, d) = way.axes
-    return a * d - b * c > 0
 
 
 def joined(parts: Iterable[Numbered]) -> tuple[Numbered, ...]:
