@@ -189,6 +189,7 @@ _MOST_ROUNDS = 8
 _SETTLED = (
     0.5  # standard deviations of a centre, rms movement of the map after which no other round is needed
 )
+_STILL = 0.1  # sigma, rms movement of the map after which outlines have the same pixels
 _FEW = 250, 1000  # pixels of a circle, enough for the first rounds
 _STEPS = 8  # Gauss-Newton steps
 _FIRST_BLUR = 1.2  # px
@@ -229,12 +230,10 @@ def measure_circles(
         centre = found.map.at(places) + fit.values[:, :2]
         mapped, departure = _mapped(raw, found, places, centre, fit, some)
         good = is_reliable(fit, departure) & _whole(found.map, places, radius, light.shape)
-        if done >= len(_FEW):  # the outlines move too little for others
-            before = (centre - fit.values[:, :2])[:, None]
-            among = before + np.stack([pixels.right, pixels.down], axis=2), pixels.root > 0
-        ahead = mapped.map.at(places)
-        moved = np.sqrt(((ahead - found.map.at(places)) ** 2).mean())
-        found = mapped
+        before, ahead = found.map.at(places), mapped.map.at(places)
+        moved, found = np.sqrt(((ahead - before) ** 2).mean()), mapped
+        around = before[:, None] + np.stack([pixels.right, pixels.down], axis=2)
+        among = (around, pixels.root > 0) if done >= len(_FEW) and moved < _STILL * blur else None
         # The first blur may be far from the true one, which is_reliable does not allow.
         some = good if good.any() else fit.step < 1
         if not some.any():
