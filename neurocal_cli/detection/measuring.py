@@ -49,8 +49,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
 from neurocal_cli.detection.fitting.edge_profile import response, sharp_profile
-from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_grid, fit_rim
-from neurocal_cli.detection.fitting.map_fit import select_map
+from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_grid, fit_rim, fit_small, map_to_rim
 from neurocal_cli.detection.fitting.strips import GridEdges, GridImage, grid_lines
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
 from neurocal_cli.detection.grey import least_variance
@@ -98,6 +97,8 @@ def measure(
         return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
     fitted = fit_grid(grid_image) if ink is None else fit_with_ink(grid_image, ink)
     grid_image = fitted.grid_image
+    if grid_image.is_small:
+        fitted = fit_small(grid_image, fitted)
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
@@ -246,18 +247,11 @@ class AlongEdges:
 
 def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges | None:
     """Measure where the outermost mid-points lie along their edges; None if the map is not accurate."""
-    if fitted.map.excess > _AGREES or (found := fit_rim(grid_image, fitted)) is None:
+    if fitted.map.excess > _AGREES or (found := map_to_rim(grid_image, fitted)) is None:
         return None
-    rim, fit = found
+    rim, fit, mapped = found
     edges, n = grid_image.edges, len(grid_image.edges.index)
     serves = edges_served(grid_image.grid.shape, edges, rim, fitted.good)
-    between, to_rim = (
-        of.observations(x.lines, x.fit.values[:, OFFSET], x.offset_variance, x.shifts.terms(x.lines))
-        for of, x in ((grid_image, fitted), (rim, fit))
-    )
-    start = fitted.map.map
-    lens = start.lens_models[start.radial :] or ((start.radial, 0),)  # a wide lens may be of a simpler kind
-    mapped = select_map(start, between.joined_with(to_rim), fitted.map.shift, models=lens)
     if mapped.excess > _AGREES:
         return None
     variance = fit.fit.covariance[:, OFFSET, OFFSET] * fit.fit.variance_growth + fitted.unevenness

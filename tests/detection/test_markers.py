@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -110,6 +111,44 @@ def test_eight_vertices_through_a_lens_are_measured_to_the_bound(
     assert np.sqrt((error**2).mean()) < 0.006
     assert np.sqrt(found.covariance[:, [0, 2]].max()) < 0.008
     assert squared.mean() < 1.6
+
+
+def fifth_of_a_board(seed: int) -> Scene:
+    """A view of 7 to 13 of 49 vertices through a lens."""
+    rng = np.random.default_rng([seed, 20])
+    plane = plane_of("charuco:8x8:40:30:DICT_4X4_50")
+    while True:
+        shift = float(rng.uniform(-250, 250)), float(rng.uniform(-250, 250))
+        drawn = int(rng.integers(1 << 30))
+        scene = marked_scene(plane, drawn, 70.0, tilt=40.0, psf=0.9, noise=3.0, k1=-0.1, shift=shift)
+        if 7 <= ground_truth(scene, 1.0).planes[0].vertices_visible.sum() <= 13:
+            return scene
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("points", ["vertices", "midpoints"])
+def test_a_fifth_of_a_board_is_not_displaced_towards_the_middle_of_the_image(
+    points: Literal["vertices", "midpoints"],
+) -> None:
+    """The lens of a view bends all its lines, and an error of it displaces all points alike."""
+    over_std = []
+    for seed in range(200):
+        scene = fifth_of_a_board(seed)
+        picture = taken(scene, seed, 4)
+        try:
+            found = detect_points(picture.image, scene.board, points)
+        except NoBoardError:
+            continue
+        true = np.array([truth_of(picture)[0][name] for name in found.ids])
+        weight = np.linalg.inv(found.covariance[:, [[0, 1], [1, 2]]])
+        if found.across is not None:  # along the edges, mid-points lie where the map says
+            variance = variance_across(found.covariance, found.across)
+            weight = found.across[:, :, None] * found.across[:, None] / variance[:, None, None]
+        outwards = (weight @ (true - [159.5, 119.5])[:, :, None])[:, :, 0]
+        error = (outwards * (found.pixels - true)).sum()
+        over_std.append(error / np.sqrt((outwards * (true - [159.5, 119.5])).sum()))
+    assert len(over_std) > 180
+    assert np.mean(np.square(over_std)) < 1.3  # 1.0 +- 0.1 by chance; 1.5 by the edges between vertices alone
 
 
 def test_blurred_markers_near_the_edges_do_not_move_them() -> None:

@@ -342,6 +342,39 @@ def _fitted(
     return fit_batch(edge_model, data, start, prior, shape, STEPS)
 
 
+def map_to_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit, MapFit] | None:
+    """Fit the edges to the board's rim, and the map through them and all others; None if there are none."""
+    found = fit_rim(grid_image, fitted)
+    if found is None:
+        return None
+    between, to_rim = (
+        of.observations(x.lines, x.fit.values[:, OFFSET], x.offset_variance, x.shifts.terms(x.lines))
+        for of, x in ((grid_image, fitted), found)
+    )
+    start = fitted.map.map
+    # A small part of a board may have been given too rich a lens, a wide lens may be of a simpler kind.
+    models = start.lens_models[1 if grid_image.is_small else start.radial :] or ((start.radial, 0),)
+    return *found, select_map(start, between.joined_with(to_rim), fitted.map.shift, models=models)
+
+
+def fit_small(grid_image: GridImage, fitted: GridFit) -> GridFit:
+    """Fit a small part of a board again, with the map through the edges to its rim as well.
+
+    The few edges between its vertices hardly tell how much the lens bends lines. Lines that are bent too much
+    or too little displace all points of the view together, towards the middle of the image or away from it,
+    which no covariance of single points can say.
+    """
+
+    def with_rim(fitted: GridFit) -> GridFit:
+        found = map_to_rim(grid_image, fitted)
+        if found is None or found[2].excess > max(_NOT_NOISE, fitted.map.excess):
+            return fitted
+        return replace(fitted, map=found[2])
+
+    first = with_rim(fitted)
+    return with_rim(replace(fit_again(grid_image, first), map=first.map))
+
+
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit] | None:
     """Fit the edges to the board's rim with the common parameters of all other edges; None if there are none.
 
