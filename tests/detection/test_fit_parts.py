@@ -25,7 +25,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur, with_shift
 from neurocal_cli.detection.fitting.edge_profile import profile, response
 from neurocal_cli.detection.fitting.map_fit import Observations, fit_map, select_map
-from neurocal_cli.detection.fitting.shading import Levels, fit_shading
+from neurocal_cli.detection.fitting.shading import Levels, Nearby, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import grid_lines, strip_pixels
 from neurocal_cli.detection.medians import upper_median
@@ -244,6 +244,17 @@ def test_levels_in_even_light_are_known_as_if_this_were_known() -> None:
         errors.append(fit_shading(frame, dark, light).at(place)[0] - 125)
     # The mean of 24 levels has 0.07, and six coefficients 0.18.
     assert np.sqrt(np.square(errors).mean()) < 0.12
+
+
+def test_levels_on_a_line_are_followed_along_it() -> None:
+    """A board of two lines that is half covered may have such squares of one colour only."""
+    frame = Frame(np.zeros(2), np.ones(2), np.array([320.0, 240.0]), 400.0)
+    place = np.stack([np.linspace(100, 540, 6), np.full(6, 240.0)], axis=1)
+    line = Nearby(frame, Levels(place, 50 + 0.1 * place[:, 0], np.ones(6)), 3)
+    level, slopes, _ = line.at(place)
+    np.testing.assert_allclose(level, line.levels.level, atol=0.1)
+    np.testing.assert_allclose(slopes, np.tile([0.1, 0.0], (6, 1)), atol=1e-3)
+    assert np.abs(line.off(line.levels)).max() < 0.1
 
 
 def test_rows_may_be_put_together() -> None:

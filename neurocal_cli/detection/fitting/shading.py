@@ -88,7 +88,8 @@ class Nearby:
         weight = _nearness(levels.place, place, _NEAREST * self.terms, itself) + _FAR
         near = polynomial_terms(self.frame, levels.place, self.terms)
         products = (near[:, :, None] * near[:, None]).reshape(len(near), -1)
-        normal = (weight @ products).reshape(len(place), self.terms, self.terms)
+        # Levels on a line determine no plane across it.
+        normal = (weight @ products).reshape(len(place), self.terms, self.terms) + _RIDGE * np.eye(self.terms)
         right = weight @ (near * levels.level[:, None])
         found = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
         level = (found * polynomial_terms(self.frame, place, self.terms)).sum(axis=1)
