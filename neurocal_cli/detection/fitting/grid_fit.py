@@ -372,7 +372,8 @@ def fit_small(grid_image: GridImage, fitted: GridFit) -> GridFit:
         return replace(fitted, map=found[2])
 
     first = with_rim(fitted)
-    return with_rim(replace(fit_again(grid_image, first), map=first.map))
+    again = fit_again(grid_image, first)  # which may have other terms of shifts
+    return with_rim(replace(again, map=replace(again.map, map=first.map.map)))
 
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit] | None:
